@@ -36,7 +36,7 @@ def test_there_are_examples():
     assert len(EXAMPLES) >= 8
 
 
-@pytest.mark.parametrize('path', map(marked, EXAMPLES))
+@pytest.mark.parametrize('path', [marked(path) for path in EXAMPLES])
 def test_example(path, variant, monkeypatch, tmp_path):
     """Without an error, with something to see in each, and without a warning of matplotlib or NumPy."""
     for module in NEEDS.get(path.stem, ()):

@@ -51,8 +51,8 @@ class Checkpoint:
     state : State
         All parameters, their moments, the densification statistic.
     arrays : dict
-        By name: `initial`, the points that the fit started from, float32 [M, 3]; `order`, the views that come next; the mean of
-        the last steps; and those of the corrections.
+        By name: `initial`, the points that the fit started from, float32 [M, 3]; `order`, the views that come next;
+        `losses`, those of the last pass; the mean of the last steps; and those of the corrections.
     seed : int
         Of all random choices.
     rng : dict

@@ -81,7 +81,7 @@ def _expected(method: Method, geometry: Geometry, views: int, count: int) -> dic
     entries: dict[str, tuple[str, tuple]] = {'born': ('bool', (count,)), 'array.order': ('int', (None,))}
     entries |= {f'{g}.{k}': ('float32', shape) for g in ('values', 'first', 'second') for k, shape in shapes.items()}
     entries |= dict.fromkeys(('gradient', 'visits'), ('float32', (count,)))
-    entries |= {'array.initial': ('float32', (None, 3))}
+    entries |= {'array.initial': ('float32', (None, 3)), 'array.losses': ('float64', (None,))}
     if method.rates.average > 0:
         entries |= {f'array.{AVERAGE}{k}': ('float32', shape) for k, shape in shapes.items()}
     if not isinstance(method, DensityMethod):

@@ -7,9 +7,9 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import drjit as dr
+import mitsuba as mi
 import numpy as np
 
 from lingo_mi.common.errors import InputError
@@ -88,7 +88,7 @@ def run(
     fit = Running(scan, scan, method, seed, stored, search)
     marks = {*(measure_at(method.iterations) if at is None else at), last}
 
-    def after(loss: Any) -> dict:
+    def after() -> dict:
         if fit.iteration in marks:
             fit.measure(measure)
         return fit.latest | ({} if search is None else dict(stops_at=last))
@@ -119,7 +119,7 @@ def _search(
     own = replace(wanted, batch=batch, stopping=stopping).bounded(seen)
     fit = Running(scan, seen, method, seed, stored, judge.record, own)
 
-    def after(loss: Any) -> dict:
+    def after() -> dict:
         if judge.due(fit.iteration):
             judge.judge(fit.iteration, fit.stepper, fit.average.of(fit.state))
         return dict(held_out=judge.record['errors'][-1] if judge.record['errors'] else float('nan'))
@@ -129,17 +129,17 @@ def _search(
 
 
 def _loop(
-    fit: Running, over: Callable[[], bool], after: Callable[[Any], dict], progress: Report | None, path: Path | None
+    fit: Running, over: Callable[[], bool], after: Callable[[], dict], progress: Report | None, path: Path | None
 ) -> None:
-    """Steps until it is over, with progress and checkpoints between them. after(loss) returns what progress shows."""
+    """Steps until it is over, with progress and checkpoints between them. after() returns what progress shows."""
     saved = time.perf_counter()
     while not over():
-        loss = fit.step()
-        shown = after(loss)
+        fit.step()
+        shown = after()
         if progress is not None:
             try:
                 count = len(fit.state) or None
-                progress(fit.iteration, loss=lambda value=loss: float(value[0]), gaussians=count, **shown)
+                progress(fit.iteration, loss=lambda: fit.loss, gaussians=count, **shown)
             except KeyboardInterrupt:
                 fit.save(path)
                 raise
@@ -168,7 +168,7 @@ class Running:
     iteration : int
         Steps done.
     history : list of dict
-        Measurements over time. Their loss is the mean over the steps since all views were seen last: single views differ.
+        Measurements over time.
     """
 
     def __init__(
@@ -198,12 +198,13 @@ class Running:
             self.points, self.order = stored.arrays['initial'], [int(i) for i in stored.arrays['order']]
             self.iteration, self._seconds, self.info = stored.iteration, stored.seconds, stored.info
             self.history = stored.history
+            self._losses.extend(mi.Float(float(loss)) for loss in stored.arrays['losses'])
             self.stepper.restore(stored.arrays)
             self.average.restore(stored.arrays)
         self._clock = time.perf_counter()
 
-    def step(self) -> Any:
-        """Densify if it is due, and make a step. Returns the loss, Float [1]."""
+    def step(self) -> None:
+        """Densify if it is due, and make a step."""
         # Before a step, so never after the last one. A longer fit that goes on from there does it first.
         if densified := self.stepper.densified(self.state, self.iteration, self.rng):
             self.state = densified
@@ -217,7 +218,11 @@ class Running:
         dr.eval(loss)  # else it would hold the images of its views
         self._losses.append(loss)
         self.average.add(self.state)
-        return loss
+
+    @property
+    def loss(self) -> float:
+        """The mean over the last pass, since single views differ."""
+        return float(np.mean([loss[0] for loss in self._losses]))
 
     def measure(self, measure: Measure | None) -> None:
         """Add an entry to the history; the time of `measure` does not count.
@@ -228,7 +233,7 @@ class Running:
             If the fit has diverged.
         """
         dr.sync_thread()
-        value = float(np.mean([float(loss[0]) for loss in self._losses]))
+        value = self.loss
         if not (np.isfinite(value) and self.state.finite()):  # a Gaussian that is not finite would silently vanish
             raise InputError(
                 f'the fit is no longer finite at iteration {self.iteration}: lower the rates, or check the projections'
@@ -251,7 +256,8 @@ class Running:
 
     def checkpoint(self, state: DeviceState | None = None) -> Checkpoint:
         """The fit as it is; with a state, of that state."""
-        model, arrays = self.stepper.model, dict(initial=self.points, order=np.array(self.order, int))
+        model, losses = self.stepper.model, np.array([loss[0] for loss in self._losses])
+        arrays = dict(initial=self.points, order=np.array(self.order, int), losses=losses)
         return Checkpoint(
             method=self.method,
             geometry=self.geometry,

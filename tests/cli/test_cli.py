@@ -74,6 +74,13 @@ def dataset(scene):
     return take_scan(load_scene(scene))
 
 
+def in_its_own_process(*arguments):
+    """A whole fit, whose sums do not depend on what this process has done before."""
+    process = fit_process(*arguments)
+    err = process.communicate()[1]
+    assert process.returncode == 0, err
+
+
 def metrics_of(folder):
     return json.loads((folder / 'metrics.json').read_text())
 
@@ -233,10 +240,10 @@ def wait_for(process, condition, seconds=300):
 
 
 @pytest.mark.posix
-def test_resume_after_kill(result, scene, tmp_path):
+def test_resume_after_kill(scene, tmp_path):
     """`kill -9` in the middle, then --resume: the same numbers as without the interruption."""
-    _, whole, _ = result
-    out = tmp_path / 'a'
+    out, whole = tmp_path / 'a', tmp_path / 'whole'
+    in_its_own_process(scene, '--iterations', '60', '--out', whole, *SMALL)
     arguments = scene, '--iterations', '60', '--out', out, *SMALL
     process = fit_process(*arguments, '-D', 'checkpoint_seconds=0')
     wait_for(process, (out / 'checkpoint.npz').exists)
@@ -244,9 +251,8 @@ def test_resume_after_kill(result, scene, tmp_path):
     process.communicate()
     assert process.returncode == -signal.SIGKILL and not (out / 'metrics.json').exists()
     assert 0 < Checkpoint.load(out / 'checkpoint.npz').iteration < 60
-    code, _, err = fit(*arguments, '--resume')
-    assert code == 0, err
-    resumed = metrics_of(out)
+    in_its_own_process(*arguments, '--resume')
+    whole, resumed = metrics_of(whole), metrics_of(out)
     for key in 'psnr_2d_r2', 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d', 'ipsd', 'gaussians', 'ipsd_targets':
         assert whole[key] is not None and resumed[key] == pytest.approx(whole[key], rel=fits_alike(1e-4)), key
     assert [h['iteration'] for h in resumed['history']] == [h['iteration'] for h in whole['history']]
@@ -257,8 +263,7 @@ def test_resume_after_kill(result, scene, tmp_path):
 def test_resume_after_kills_in_a_search(scene, tmp_path):
     """`kill -9` while the fit searches for the step to stop at, --resume, `kill -9` while it goes there, and --resume."""
     arguments = scene, '--iterations', '60', *SMALL, '-D', 'stop=on', '-D', 'stop_every=5', '-D', 'stop_patience=15'
-    code, _, err = fit(*arguments, '--out', tmp_path / 'whole')
-    assert code == 0, err
+    in_its_own_process(*arguments, '--out', tmp_path / 'whole')
     out, more = tmp_path / 'a', []
     for searching in True, False:
         process = fit_process(*arguments, '--out', out, '-D', 'checkpoint_seconds=0', *more)
@@ -267,8 +272,7 @@ def test_resume_after_kills_in_a_search(scene, tmp_path):
         process.communicate()
         assert process.returncode == -signal.SIGKILL and not (out / 'metrics.json').exists()
         more = ['--resume']
-    code, _, err = fit(*arguments, '--out', out, '--resume')
-    assert code == 0, err
+    in_its_own_process(*arguments, '--out', out, '--resume')
     whole, resumed = metrics_of(tmp_path / 'whole'), metrics_of(out)
     for key in 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d', 'ipsd', 'gaussians', 'iterations':
         assert whole[key] is not None and resumed[key] == pytest.approx(whole[key], rel=fits_alike(1e-4)), key

@@ -57,7 +57,7 @@ def marked(case):
     return pytest.param(case, marks=marks, id=case.name)
 
 
-@pytest.mark.parametrize('case', map(marked, CASES))
+@pytest.mark.parametrize('case', [marked(case) for case in CASES])
 def test_case(case, variant):
     assert not miss(case, measure(case), variant)
 

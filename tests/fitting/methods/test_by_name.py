@@ -142,9 +142,10 @@ def test_abstract_classes_are_no_methods():
 def test_a_method_of_another_package(tmp_path):
     """It is found by its name, fits, is saved, and is loaded again."""
     scan = tiny_scan(geometry())
-    fit = lm.fit(scan, 'outsider:line_points=40,lambda_root=3', lambda_tv=0.0, progress=False, folder=tmp_path / 'fit')
+    method = 'outsider:line_points=40,lambda_root=3,iterations=24'
+    fit = lm.fit(scan, method, lambda_tv=0.0, progress=False, folder=tmp_path / 'fit')
     assert fit.method.start == LineStart(40) and fit.method.loss == RootLoss(lambda_tv=0.0, lambda_root=3.0)
-    assert type(fit) is lm.Fit and fit.steps == 12 and len(fit.checkpoint.arrays['initial']) == 40
+    assert type(fit) is lm.Fit and fit.steps == 24 and len(fit.checkpoint.arrays['initial']) == 40
     assert fit.info['method'] == 'line' and not fit.checkpoint.arrays['initial'][:, :2].any()
     assert fit.history[-1]['loss'] < fit.history[0]['loss']
     for path in (tmp_path / 'fit', tmp_path / 'fit' / 'checkpoint.npz'):
