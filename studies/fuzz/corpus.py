@@ -311,7 +311,7 @@ def _checkpoints():
     geometry = Geometry.cone(DSO=10, DSD=15, nDetector=4, dDetector=1, nVoxel=4, dVoxel=1, angles=np.arange(3) / 2)
     method = LINGO().changed(average=0.5)
     state = method.starting_state(StartingCloud(np.full((5, 3), 0.5), np.ones(5), np.full(5, 0.1)), 1.0)
-    arrays = {'initial': np.ones((5, 3), np.float32), 'order': np.arange(3)}
+    arrays = {'initial': np.ones((5, 3), np.float32), 'order': np.arange(3), 'losses': np.ones(3)}
     arrays |= {f'average.{name}': value for name, value in state.values.items()}
     checkpoint = Checkpoint(
         method, geometry, 1.0, state, arrays, seed=0, rng=dict(np.random.default_rng(0).bit_generator.state), iteration=7,
