@@ -56,7 +56,7 @@ def read_r2_cloud(path: PathLike | str, grid: Grid) -> _Cloud:
     elif path.suffix == '.pickle':
         cloud = _activated(path, load_pickle(path), mm)
     else:
-        raise InputError(f'{path}: is no cloud of R2-Gaussian; give its init_*.npy or point_cloud.pickle')
+        raise InputError(f'{path}: is not a cloud of R2-Gaussian; give its init_*.npy or point_cloud.pickle')
     centres, scales, quaternions, density = (np.asarray(values, np.float32) for values in cloud)
     check_cloud(path, centres, scales, quaternions, density)
     return centres, scales, quaternions, density
@@ -97,7 +97,7 @@ def write_r2_cloud(
     Raises
     ------
     InputError
-        For another suffix, for arrays that are no cloud, for negative densities, and for a file that cannot be written.
+        For another suffix, for arrays that are not a cloud, for negative densities, and for a file that cannot be written.
     """
     path = Path(path)
     centres, scales, quaternions, density = (np.asarray(a, float) for a in (centres, scales, quaternions, density))

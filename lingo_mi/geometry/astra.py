@@ -136,7 +136,7 @@ def in_space(proj_geom: dict) -> dict:
     Raises
     ------
     InputError
-        If a number is missing, or the vectors are no poses.
+        If a number is missing, or the vectors are not poses.
     """
     kind = kind_of(proj_geom)
     if kind not in IN_PLANE:
@@ -187,7 +187,7 @@ def pose_rays(proj_geom: dict) -> tuple[Rays, tuple[int, int]]:
     Raises
     ------
     InputError
-        If the type is another one, a number is missing, or the vectors are no poses.
+        If the type is another one, a number is missing, or the vectors are not poses.
     """
     kind = kind_of(proj_geom)
     if kind not in VECTORS:

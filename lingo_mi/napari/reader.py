@@ -32,7 +32,7 @@ def reader_of(path: str | list[str]) -> Callable[[str | list[str]], list[LayerDa
 
 
 def read(path: str | list[str]) -> list[LayerData]:
-    """The layers of a file or a folder: arrays, what napari is told of each, and its type.
+    """The layers of a file or a folder: the array, the options and the type of each.
 
     Volumes are [z, y, x] in mm. Points are (z, y, x) in mm, as large as the Gaussians at one standard deviation on either side.
     Projections are [view, v, u].
@@ -51,8 +51,8 @@ def read(path: str | list[str]) -> list[LayerData]:
 
 def volume_layer(volume: np.ndarray, spacing: Any, first: Any, name: str) -> LayerData:
     """An image layer of a volume [x, y, z] whose first voxel's centre lies at `first`, mm."""
-    told = dict(name=name, scale=tuple(spacing)[::-1], translate=tuple(first)[::-1], metadata=dict(unit='1/mm'))
-    return np.asarray(volume).T, told, 'image'
+    options = dict(name=name, scale=tuple(spacing)[::-1], translate=tuple(first)[::-1], metadata=dict(unit='1/mm'))
+    return np.asarray(volume).T, options, 'image'
 
 
 def scan_layer(projections: np.ndarray, geometry: Geometry, name: str) -> LayerData:
@@ -93,7 +93,7 @@ def _layers(path: Path) -> list[LayerData]:
 
 def _cloud(path: Path) -> LayerData:
     centres, scales, _, density = read_ply(path)
-    told = dict(
+    options = dict(
         name=path.name,
         size=2 * scales.mean(1),
         features=dict(density=density),
@@ -103,4 +103,4 @@ def _cloud(path: Path) -> LayerData:
         opacity=0.6,
         out_of_slice_display=True,
     )
-    return centres[:, ::-1], told, 'points'
+    return centres[:, ::-1], options, 'points'

@@ -34,8 +34,8 @@ class FitWidget(widgets.Container):
         )
         self.steps = widgets.SpinBox(label='Steps', min=1, max=1_000_000, value=METHODS['fast'].iterations)
         self.start, self.cancel = widgets.PushButton(text='Fit'), widgets.PushButton(text='Cancel', enabled=False)
-        self.said = widgets.Label(value='')
-        super().__init__(widgets=[self.scan, self.method, self.steps, self.start, self.cancel, self.said])
+        self.status = widgets.Label(value='')
+        super().__init__(widgets=[self.scan, self.method, self.steps, self.start, self.cancel, self.status])
         self.start.changed.connect(self.fit)
         self.cancel.changed.connect(self._stop.set)
 
@@ -55,7 +55,7 @@ class FitWidget(widgets.Container):
             ensure_variant()  # of this thread
             method, scan = method_of(name, iterations=steps), read_scan(path).train
 
-            def look(fit: Fit) -> dict:
+            def show(fit: Fit) -> dict:
                 self._show(fit.own_volume, scan.geometry.grid, fit.steps, steps)
                 return {}
 
@@ -63,7 +63,7 @@ class FitWidget(widgets.Container):
                 if self._stop.is_set():
                     raise KeyboardInterrupt
 
-            run(scan, method, measure=look, progress=between)
+            run(scan, method, measure=show, progress=between)
         except KeyboardInterrupt:
             return 'cancelled'
         except InputError as error:
@@ -73,13 +73,13 @@ class FitWidget(widgets.Container):
     @ensure_main_thread
     def _show(self, volume: Any, grid: Any, done: int, steps: int) -> None:
         first = grid.low + [s / 2 for s in grid.spacing]
-        data, told, _ = volume_layer(volume, grid.spacing, first, f'fit of {self.scan.value.name}')
+        data, options, _ = volume_layer(volume, grid.spacing, first, f'fit of {self.scan.value.name}')
         if self._layer is None:
-            self._layer = self._viewer.add_image(data, **told)
+            self._layer = self._viewer.add_image(data, **options)
         else:
             self._layer.data = data
-        self.said.value = f'step {done:,} of {steps:,}'
+        self.status.value = f'step {done:,} of {steps:,}'
 
-    def _end(self, said: str) -> None:
+    def _end(self, status: str) -> None:
         self.start.enabled, self.cancel.enabled = True, False
-        self.said.value = said
+        self.status.value = status

@@ -75,7 +75,7 @@ def open_dicom(path: Path, files: Iterable[Path]) -> Recording:
     for file in sorted(files, key=by_number):
         header = read_dicom_file(file, pixels=False)
         if header is None:
-            raise InputError(f'{file}: is no DICOM file; export it again, or take it out of the folder')
+            raise InputError(f'{file}: is not a DICOM file; export it again, or take it out of the folder')
         own = _CT_PD if dicom_ct_pd.is_projection(header) else _XA
         if kind not in (None, own):
             raise InputError(f'{file}: is of another kind than {found[0][1].name}; put one scan in a folder of its own')

@@ -53,12 +53,12 @@ def numbers(file: Path, header: Any) -> _Run:
     Raises
     ------
     InputError
-        If it is no projection, or its pixels do not grow with the counts.
+        If it is not a projection, or its pixels do not grow with the counts.
     """
     if _found(header, 0, 'ImagePositionPatient') is not None:
         name = header.get('SOPClassUID')
         raise InputError(
-            f'{file}: is no projection, but a slice or a volume ({getattr(name, "name", "of no class")}): read it as a volume'
+            f'{file}: is not a projection, but a slice or a volume ({getattr(name, "name", "of no class")}): read it as a volume'
         )
     relation, lut = header.get('PixelIntensityRelationship') or 'LIN', None
     if relation != 'LIN':

@@ -1,4 +1,4 @@
-"""Files and folders of raw frames: TIFF, EDF, RTK's, .npy and HDF5 here, others in files of their own."""
+"""Files and folders of raw frames: TIFF, EDF, RTK's and .npy here, others in files of their own."""
 
 from __future__ import annotations
 
@@ -11,11 +11,9 @@ import numpy as np
 from lingo_mi.common.errors import InputError
 from lingo_mi.files import arrays
 from lingo_mi.files.slices import by_number, read_tiff_file, require_chain
-from lingo_mi.raw import dicom, pictures, zeiss
+from lingo_mi.raw import dicom, hdf5, pictures, zeiss
 from lingo_mi.raw.recording import Frames, Recording, checked
 from lingo_mi.storage.file_access import one_line, optional, reading
-
-LINKED = 4  # groups below the root in which frames are looked for: entry, subentry, instrument, detector
 
 
 def open_recording(path: PathLike | str) -> Recording:
@@ -73,7 +71,9 @@ def _folder(path):
 def _image(path):
     image = IMAGES[path.suffix.lower()](path)
     if image.ndim != 2 or image.size == 0:
-        raise InputError(f'{path}: is damaged, or no image of one channel (its shape is {image.shape}); copy it again')
+        raise InputError(
+            f'{path}: is damaged, or not an image of one channel (its shape is {image.shape}); copy it again'
+        )
     return image
 
 
@@ -129,90 +129,6 @@ def _array(path):
     return Recording(Frames(str(path), len(stack), stack.shape[1:], stack.dtype, lambda i: stack[i]))
 
 
-# ---- HDF5 --------------------------------------------------------------------------------------------------
-
-
-def _hdf5(path):
-    h5py = optional('h5py')
-    file = h5py.File(path, 'r')
-
-    def stack(data):
-        if data.ndim == 2:
-            return Frames(str(path), 1, data.shape, data.dtype, lambda i: data[()])
-        if data.ndim != 3:
-            raise InputError(f'{path}: {data.name} has the shape {data.shape}; frames are [n, v, u]')
-        return Frames(str(path), len(data), data.shape[1:], data.dtype, lambda i: data[i])
-
-    _require_links(path, file)
-    if 'exchange/data' in file:  # DXchange
-        group = file['exchange']
-        flats, darks = (
-            stack(group[name]) if name in group and len(group[name]) else None for name in ('data_white', 'data_dark')
-        )
-        angles = np.asarray(group['theta'], float).ravel() if 'theta' in group else None
-        if angles is not None and _unit(group['theta']).startswith('rad'):
-            angles = np.degrees(angles)
-        return Recording(stack(group['data']), flats, darks, angles)
-    entry = _nxtomo(file)
-    if entry is None:
-        raise InputError(f'{path}: is neither DXchange (/exchange/data) nor NXtomo (instrument/detector/data)')
-    detector = entry['instrument/detector']
-    every = stack(detector['data'])
-    # ESRF's image_key_control also tells alignment frames (-1), which image_key takes for views.
-    name = 'image_key_control' if 'image_key_control' in detector else 'image_key'
-    key = np.asarray(detector[name], int) if name in detector else np.zeros(len(every), int)
-    if key.shape != (len(every),):
-        raise InputError(f'{path}: {name} has {key.size} entries for {len(every)} frames; these must agree')
-
-    def of(kind):
-        return every.subset(np.flatnonzero(key == kind)) if (key == kind).any() else None
-
-    views = of(0)
-    if views is None:
-        raise InputError(f'{path}: {name} marks no projection (0); nothing can be imported')
-    angles = None
-    if 'sample/rotation_angle' in entry:
-        data = entry['sample/rotation_angle']
-        angles = np.asarray(data, float).ravel()
-        angles = np.degrees(angles) if _unit(data).startswith('rad') else angles
-        angles = angles[key == 0] if len(angles) == len(key) else angles
-    return Recording(views, of(1), of(2), angles)
-
-
-def _require_links(path, file):
-    """Raises InputError where data are in another file that is not there: HDF5 says no more than that it cannot open it."""
-    import h5py
-
-    def follow(group, depth):
-        for name in group:
-            link = group.get(name, getlink=True)
-            if isinstance(link, h5py.ExternalLink):
-                target = Path(path).parent / link.filename  # an absolute name stays
-                if not target.exists():
-                    raise InputError(
-                        f'{path}: {group.name.rstrip("/")}/{name} is a link to {link.filename}, which is not there; put that '
-                        f'file beside {Path(path).name}'
-                    )
-            elif depth and isinstance(link, h5py.HardLink) and group.get(name, getclass=True) is h5py.Group:
-                follow(group[name], depth - 1)
-
-    follow(file, LINKED)
-
-
-def _nxtomo(file):
-    """The first group with instrument/detector/data, among the root, its entries and their subentries."""
-    groups = [file, *file.values()]
-    for group in list(groups):
-        if hasattr(group, 'values') and group is not file:
-            groups += list(group.values())
-    return next((g for g in groups if hasattr(g, 'values') and 'instrument/detector/data' in g), None)
-
-
-def _unit(data):
-    unit = np.ravel(data.attrs.get('units', 'degree'))[0]  # also of an array of one
-    return (unit.decode() if isinstance(unit, bytes) else str(unit)).lower()
-
-
 # Readers by suffix: of one image of a folder, and of a file that holds a whole recording.
 IMAGES: dict[str, Callable[[Path], np.ndarray]] = {
     **dict.fromkeys(('.tif', '.tiff'), read_tiff_file),
@@ -226,5 +142,5 @@ FILES: dict[str, Callable[[Path], Recording]] = {
     '.edf': _edf,
     **dict.fromkeys(zeiss.SUFFIXES, zeiss.open_txrm),
     **dict.fromkeys(dicom.SUFFIXES, dicom.open_file),
-    **dict.fromkeys(('.h5', '.hdf5', '.hdf', '.nxs', '.nx'), _hdf5),
+    **dict.fromkeys(('.h5', '.hdf5', '.hdf', '.nxs', '.nx'), hdf5.open_hdf5),
 }

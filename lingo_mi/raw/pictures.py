@@ -33,6 +33,6 @@ def read_picture(path: Path) -> np.ndarray:
         raise
     except (Image.DecompressionBombError, SyntaxError, ValueError) as error:
         text = one_line(error)[:120]
-        raise InputError(f'{path}: is damaged or no image ({text}); copy or write it again') from None
+        raise InputError(f'{path}: is damaged or not an image ({text}); copy or write it again') from None
     # Older versions of Pillow read 16 bits into 32.
     return counts.astype(np.uint16) if counts.dtype.itemsize > 1 and counts.max(initial=0) < 1 << 16 else counts

@@ -52,7 +52,7 @@ def require_enough(n: int, columns: int) -> None:
     """Raises InputError for fewer than `LEAST_VIEWS` views or `LEAST_COLUMNS` columns."""
     if n < LEAST_VIEWS or columns < LEAST_COLUMNS:
         raise InputError(
-            f'rings are told from the object in {LEAST_VIEWS} or more views of {LEAST_COLUMNS} or more columns, not in {n} of '
+            f'rings differ from the object in {LEAST_VIEWS} or more views of {LEAST_COLUMNS} or more columns, not in {n} of '
             f'{columns}: leave rings out, and let a fit find the offsets of pixels (fit_pixels=one)'
         )
 

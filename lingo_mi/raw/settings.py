@@ -38,7 +38,7 @@ class Settings:
             try:
                 parser.read_string(path.read_text(encoding='utf-8', errors='replace'))
             except configparser.Error as error:
-                raise InputError(f'{path}: is no {kind} file ({one_line(error)[:120]})') from None
+                raise InputError(f'{path}: is not a {kind} file ({one_line(error)[:120]})') from None
         if not parser.has_section(section):
             raise InputError(f'{path}: has no section [{section}]; give the {kind} of the scan')
         return cls(path, kind, parser)
@@ -53,7 +53,7 @@ class Settings:
         Raises
         ------
         InputError
-            If it is missing and has no default, and if it is none.
+            If it is missing without a default, or is not a number.
         """
         text = self.text(section, name)
         if not text and default is not None:
@@ -74,7 +74,7 @@ class Settings:
         Raises
         ------
         InputError
-            If they make no scan.
+            If they do not make a scan.
         """
         n, near, far = (self.number(*place) for place in (views, DSO, DSD))
         if not 1 <= n <= MOST_VIEWS or not far >= near > 0:

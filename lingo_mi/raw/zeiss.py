@@ -32,7 +32,7 @@ def open_txrm(path: Path) -> Recording:
     """
     olefile = optional('olefile')
     if not olefile.isOleFile(str(path)):
-        raise InputError(f'{path}: is no {path.suffix} file, or is damaged; copy it again')
+        raise InputError(f'{path}: is not a {path.suffix} file, or is damaged; copy it again')
     ole = olefile.OleFileIO(str(path))
     n, rows, columns = (
         _integer(path, ole, f'ImageInfo/{name}') for name in ('NoOfImages', 'ImageHeight', 'ImageWidth')

@@ -9,6 +9,7 @@ import numpy as np
 
 from lingo_mi.common.notebook import grey_range
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.metrics.quality import psnr_2d
 from lingo_mi.report.data import REAL, ReportData
 from lingo_mi.report.figures import DIFFERENCE, MOST_POINTS
 from lingo_mi.report.packing import MOST_VOXELS, Arrays, bits_within, block_means, preview
@@ -66,11 +67,9 @@ def payload(data: ReportData, surfaces: bool = True, earlier: Arrays | None = No
 
 def _psnr_by_view(views: np.ndarray, truth: np.ndarray, angles: np.ndarray) -> list[float | None]:
     """PSNR of each view in the order of their angles, dB, None where it is infinite; full scale is the largest value of all."""
-    peak, found = float(truth.max()), []
-    for i in np.argsort(angles, kind='stable'):
-        error = float(np.mean(np.square(views[i].astype(float) - truth[i])))
-        found.append(10 * float(np.log10(peak**2 / error)) if error > 0 and peak > 0 else None)
-    return found
+    peak, order = float(truth.max()), np.argsort(angles, kind='stable')
+    values = [psnr_2d(views[i : i + 1], truth[i : i + 1], peak) if peak > 0 else np.inf for i in order]
+    return [value if np.isfinite(value) else None for value in values]
 
 
 def slice_payload(

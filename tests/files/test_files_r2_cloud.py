@@ -109,7 +109,7 @@ def test_other_files(tmp_path):
     with pytest.raises(InputError, match='a.pickle: is truncated'):
         read_r2_cloud(tmp_path / 'a.pickle', GRID)
     with pytest.raises(
-        InputError, match=r'a.ply: is no cloud of R2-Gaussian; give its init_\*.npy or point_cloud.pickle'
+        InputError, match=r'a.ply: is not a cloud of R2-Gaussian; give its init_\*.npy or point_cloud.pickle'
     ):
         read_r2_cloud(tmp_path / 'a.ply', GRID)
     with pytest.raises(InputError, match='a.ply: clouds of R2-Gaussian are'):

@@ -33,20 +33,20 @@ def folder(tmp_path_factory):
 
 def test_a_result_is_its_volume_and_its_cloud(folder):
     assert reader_of(str(folder)) is read
-    (volume, told, kind), (points, of_points, other) = read(str(folder))
+    (volume, options, kind), (points, of_points, other) = read(str(folder))
     assert (kind, other) == ('image', 'points')
     assert volume.shape == (6, 5, 4)
-    np.testing.assert_allclose(told['scale'], (3, 2, 1))
-    np.testing.assert_allclose(told['translate'], (-7.5, -4, -1.5))
+    np.testing.assert_allclose(options['scale'], (3, 2, 1))
+    np.testing.assert_allclose(options['translate'], (-7.5, -4, -1.5))
     assert points.shape == (7, 3)
     np.testing.assert_allclose(of_points['size'], 1)
     np.testing.assert_allclose(points[:, ::-1], np.random.default_rng(0).random((7, 3)), atol=2)
 
 
 def test_projections_are_a_stack(folder):
-    [(views, told, kind)] = read([str(folder / 'scan.npy')])
-    assert (views.shape, kind, told['scale']) == ((5, 6, 8), 'image', (1, 2.0, 3.0))
-    assert len(told['metadata']['angles']) == 5
+    [(views, options, kind)] = read([str(folder / 'scan.npy')])
+    assert (views.shape, kind, options['scale']) == ((5, 6, 8), 'image', (1, 2.0, 3.0))
+    assert len(options['metadata']['angles']) == 5
 
 
 def test_what_it_does_not_know_is_left_to_others(folder, tmp_path):

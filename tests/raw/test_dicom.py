@@ -203,7 +203,7 @@ def test_enhanced_angiography(tmp_path):
         (dict(steps=[0.0, 1.0, 2.0]), r'PositionerPrimaryAngle.*'),
         (dict(PixelIntensityRelationship='DISP'), "is 'DISP', and no ModalityLUTSequence"),
         (dict(PixelIntensityRelationshipSign=-1), 'its pixels fall with the intensity'),
-        (dict(ImagePositionPatient=[0, 0, 0]), 'is no projection, but a slice or a volume'),
+        (dict(ImagePositionPatient=[0, 0, 0]), 'is not a projection, but a slice or a volume'),
         (dict(NumberOfFrames=2_000_000_000), 'NumberOfFrames .* must be from 1 to 100000'),
         (dict(SamplesPerPixel=3), 'has no image of one value a pixel'),
     ],
@@ -229,7 +229,7 @@ def test_damaged_files(tmp_path):
         with pytest.raises(lm.InputError, match='a.dcm'):
             load(path, i0=4000)
     path.write_bytes(b'none')
-    with pytest.raises(lm.InputError, match=r'a.dcm: is no DICOM file'):
+    with pytest.raises(lm.InputError, match=r'a.dcm: is not a DICOM file'):
         load(path, i0=4000)
 
 

@@ -72,7 +72,7 @@ def test_centre_of_rotation(xtekct):
         ('SrcToObject=76\n', '', 'SrcToObject is missing'),
         ('Projections=4', 'Projections=many', 'Projections must be a number'),
         ('[XTekCT]', '[Other]', 'no section'),
-        ('[XTekCT]', 'XTekCT', 'no .xtekct file'),
+        ('[XTekCT]', 'XTekCT', 'not a .xtekct file'),
         ('SrcToObject=76', 'SrcToObject=7600', 'SrcToDetector >= SrcToObject'),
     ],
 )

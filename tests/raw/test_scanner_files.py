@@ -151,7 +151,7 @@ def test_nsi_as_mbirjax_reads_it():
         ('.log', '[Acquisition]', '[Other]', r'has no section \[Acquisition\]'),
         ('.log', 'Rotation Step (deg)=0.600', 'Rotation Step (deg)=0,6', 'must be a number'),
         ('.pca', 'FOD=16.6', 'FOD=1600', 'needs NumberImages from 1 to 100000 and FDD >= FOD > 0'),
-        ('.pca', '[Geometry]', '', 'is no .pca file'),
+        ('.pca', '[Geometry]', '', 'is not a .pca file'),
         ('.pca', 'PixelsizeX=0.05000000\n', '', 'PixelsizeX is missing'),
         ('.nsipro', '<source>0 0 -300', '', 'source of <Result> is missing'),
         ('.nsipro', '<source>0 0 -300', '<source>0 0', 'source of <Result> must be 3 numbers'),

@@ -14,10 +14,10 @@ class Probe {
     bar.append(this.pick, this.tool);
     this.profile = element('div', { class: 'chart' });
     this.histogram = element('div', { class: 'chart' });
-    this.said = text('p', '', { class: 'note' });
+    this.note = text('p', '', { class: 'note' });
     this.table = element('table', { class: 'readout' });
     const left = element('div');
-    left.append(text('h3', 'Profile'), this.profile, this.said);
+    left.append(text('h3', 'Profile'), this.profile, this.note);
     const right = element('div');
     right.append(text('h3', 'Histogram of the volume'), this.histogram);
     const pair = element('div', { class: 'pair' });
@@ -99,7 +99,7 @@ class Probe {
     }));
     lineChart(this.profile, `${this.along < 3 ? AXES[this.along] : 'along the line'} [mm], ${slices.known.quantity}`, x, lines, { height: 200 });
     const written = (p) => p.map((v) => v.toFixed(1)).join(', ');
-    this.said.textContent = `From (${written(from)}) to (${written(to)}) mm, ${length.toFixed(1)} mm: the values of the voxels there, without interpolation.`;
+    this.note.textContent = `From (${written(from)}) to (${written(to)}) mm, ${length.toFixed(1)} mm: the values of the voxels there, without interpolation.`;
   }
 
   paintRegion() {
