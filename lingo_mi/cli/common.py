@@ -36,6 +36,21 @@ class Parser(argparse.ArgumentParser):
         Parser.running = self, found[0]
         return found
 
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as error:
+            error.message += parsing.nearest(str(value), map(str, action.choices or ()))
+            raise
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:  # type: ignore[override]
+        parsed, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            name = unknown[0].partition('=')[0].lstrip('-')  # all options share the dashes
+            near = parsing.nearest(name, (option.lstrip('-') for option in self._option_string_actions))
+            self.error(f'unrecognized arguments: {" ".join(unknown)}{near.replace("mean ", "mean --")}')
+        return parsed
+
     def error(self, message: str) -> NoReturn:
         self.exit(2, f'error: {brief(message, 250)} (see --help)\n')
 
