@@ -49,6 +49,7 @@ from lingo_mi.validation.tables.record import Record
 
 SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made of
 R2_ERROR = 0.15  # of asd-pocs-r2: the error of its views at which least total variation goes first, over their norm
+LATER = {'fit_pixels': 'off'}  # settings that came after published cells, and their values in those
 NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d_r2', 'ipsd'), ('psnr_3d_r2', 'ssim_3d_r2')  # of a fit's views; of a volume
 
 # What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults, and in
@@ -210,6 +211,7 @@ class Cells:
         settings = method_for(fit, self.scale).flat()
         del settings['checkpoint_seconds']
         iterations = settings.pop('iterations')
+        settings = {name: value for name, value in settings.items() if LATER.get(name, ...) != value}
         return where / f'{fit.method.replace(":", "_")}_{_hash(of_scan | settings)}' / str(iterations) / 'fit.json'
 
     def folder_of(self, fit: Fit) -> Path:
