@@ -1,6 +1,6 @@
-"""The table of docs/gpu.md: what the model predicts for cards that were not at hand, from what `count` counted.
+"""The table of studies/cuda/README.md: what the model predicts for cards that were not at hand, from what `count` counted.
 
-    python -m studies.cuda.report docs/gpu.md
+    python -m studies.cuda.report studies/cuda/README.md
 
 writes it between its markers.
 """
