@@ -394,7 +394,7 @@ def test_a_region_has_the_statistics_of_its_voxels(page, data):
     row = page.locator('tr[data-layer=Reconstruction] td')
     found = [float(cell.text_content()) for cell in row.all()]
     np.testing.assert_allclose(found, [voxels.mean(), voxels.std(), voxels.min(), voxels.max()], atol=2e-5)
-    assert '3.0 × 3.0 mm, 3 × 2 voxels' in page.locator('#slices caption', has_text='Region').text_content()
+    assert '3.0 × 3.0 mm, 3 × 2 voxels' in page.locator('#slices .note', has_text='Region').text_content()
 
 
 def test_a_line_is_drawn_and_the_histogram_counts_all_voxels(page, data):

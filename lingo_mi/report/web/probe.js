@@ -15,17 +15,18 @@ class Probe {
     this.profile = element('div', { class: 'chart' });
     this.histogram = element('div', { class: 'chart' });
     this.note = text('p', '', { class: 'note' });
+    this.caption = text('p', '', { class: 'note' });
     this.table = element('table', { class: 'readout' });
     const left = element('div');
     left.append(text('h3', 'Profile'), this.profile, this.note);
     const right = element('div');
-    right.append(text('h3', 'Histogram of the volume'), this.histogram);
+    right.append(text('h3', 'Histogram of the volume, voxels on a logarithmic scale'), this.histogram);
     const pair = element('div', { class: 'pair' });
     pair.append(left, right);
     const scroll = element('div', { class: 'scroll' });
     scroll.append(this.table);
     this.root = element('div');
-    this.root.append(bar, pair, scroll);
+    this.root.append(bar, pair, this.caption, scroll);
     this.paint = onceAFrame(() => this.update());
     let width = 0;
     new ResizeObserver(() => {
@@ -97,15 +98,15 @@ class Probe {
         return voxel.every((v, a) => v >= 0 && v < shape[a]) ? slices.value(l.i, slices.index(voxel)) : null;
       }),
     }));
-    lineChart(this.profile, `${this.along < 3 ? AXES[this.along] : 'along the line'} [mm], ${slices.known.quantity}`, x, lines, { height: 200 });
+    lineChart(this.profile, `${this.along < 3 ? AXES[this.along] : 'along the line'} [mm]`, x, lines, { height: 200 });
     const written = (p) => p.map((v) => v.toFixed(1)).join(', ');
-    this.note.textContent = `From (${written(from)}) to (${written(to)}) mm, ${length.toFixed(1)} mm: the values of the voxels there, without interpolation.`;
+    this.note.textContent = `${slices.known.quantity}, from (${written(from)}) to (${written(to)}) mm, ${length.toFixed(1)} mm: the values of the voxels there, without interpolation.`;
   }
 
   paintRegion() {
     const { slices } = this;
     const { region } = slices.marks;
-    if (!region) return this.table.replaceChildren();
+    if (!region) return;
     const { shape, spacing } = slices.known;
     const [low, high] = [0, 1].map((end) => slices.at.map((i, a) => {
       if (a === region.axis) return i;
@@ -130,7 +131,7 @@ class Probe {
         n += 1;
       }
       const mean = sum / n;
-      return [l.name, mean, Math.sqrt(Math.max(0, squares / n - mean * mean)), least, most].map((v) => (typeof v === 'string' ? v : shown(v, step / 10)));
+      return [l.name, mean, Math.sqrt(Math.max(0, squares / n - mean * mean)), least, most].map((v) => (typeof v === 'string' ? v : shown(v, step)));
     });
     const top = element('tr');
     top.append(...['Region', 'mean', 'std', 'min', 'max'].map((n) => text('th', n, { scope: 'col' })));
@@ -141,8 +142,8 @@ class Probe {
     });
     const [name] = PLANES[region.axis];
     const mm = sides.map((a, k) => (size[k] * spacing[a]).toFixed(1)).join(' × ');
-    const caption = `Region of the ${name.toLowerCase()} slice: ${mm} mm, ${size.join(' × ')} voxels; ${slices.known.quantity}`;
-    this.table.replaceChildren(text('caption', caption, { style: 'text-align: left; color: var(--soft)' }), top, ...made);
+    this.caption.textContent = `Region of the ${name.toLowerCase()} slice: ${mm} mm, ${size.join(' × ')} voxels; ${slices.known.quantity}`;
+    this.table.replaceChildren(top, ...made);
   }
 
   paintHistogram() {
@@ -159,6 +160,6 @@ class Probe {
     });
     this.counts = lines;
     const x = Array.from({ length: BINS }, (_, i) => low + (i + 0.5) * width);
-    lineChart(this.histogram, `${slices.known.quantity}, voxels on a logarithmic scale`, x, lines, { height: 200, log: true, gaps: true });
+    lineChart(this.histogram, slices.known.quantity, x, lines, { height: 200, log: true, gaps: true });
   }
 }
