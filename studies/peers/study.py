@@ -35,6 +35,7 @@ from lingo_mi.projectors import grid
 from lingo_mi.reconstruction import ASDPOCS, FDK, SART, Best, Reconstruction, Refined
 from lingo_mi.reconstruction.held_out import split_views
 from lingo_mi.reconstruction.run import run_algorithm
+from lingo_mi.reconstruction.voxel_values import means
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.simulate import choose_views
 from lingo_mi.storage.file_access import replacing, write_text
@@ -73,9 +74,15 @@ def _qggmrf(scan: Scan, sharpness: float) -> np.ndarray:
 
 
 def _wrong(volume: np.ndarray, held_out: Scan) -> float:
-    """Root mean square error of a volume's projections over the valid pixels of views."""
+    """Root mean square error of a volume's projections over the valid pixels of views. The voxels may be smaller ones."""
+    held_out = held_out.on(held_out.geometry.grid.finer(_finer(volume, held_out)))
     wrong = (grid.project_volume(volume, held_out.geometry) - held_out.projections).astype(float)
     return float(np.sqrt(np.mean(np.square(wrong if held_out.valid is None else wrong[held_out.valid]))))
+
+
+def _finer(volume: np.ndarray, scan: Scan) -> int:
+    """How many voxels of the volume are as wide as one of the scan's."""
+    return volume.shape[0] // scan.geometry.grid.shape[0]
 
 
 def _mbirjax() -> Any:
@@ -128,6 +135,7 @@ METHODS = {
     'fast': Method("`fast`, the cloud's volume", lambda scan: _cloud(scan)(scan.geometry.grid)),
     'refined': Method('`fast`, then `refined`, `finer=2`', _refined),
     'best': Method('`best`', lambda scan: run_algorithm(scan, Best()).volume),
+    'best-finer': Method("`best`, `voxels='finer'`", lambda scan: run_algorithm(scan, Best(voxels='finer')).volume),
 }
 NEEDS = {
     'rtk-tv': (_itk, "RTK: pip install -e '.[reference]'"),
@@ -247,7 +255,8 @@ class Study:
         began, processor = time.perf_counter(), time.process_time()
         volume, settings = method_of(method).run(chosen.train)
         seconds, processor = time.perf_counter() - began, time.process_time() - processor
-        Reconstruction(volume, [], seconds, chosen.train.geometry.grid).save(
+        finer = _finer(volume, chosen.train)
+        Reconstruction(volume, [], seconds, chosen.train.geometry.grid.finer(finer)).save(
             self._volume_path(_case(len(chosen.train)), method), force=True
         )
         return dict(
@@ -255,7 +264,7 @@ class Study:
             method=method,
             settings=settings,
             held_out_rms=_wrong(volume, chosen.test),
-            psnr_3d=psnr_3d(volume, self.reference()),
+            psnr_3d=psnr_3d(means(volume, finer), self.reference()),
             seconds=seconds,
             processor_seconds=processor,
             provenance=provenance(),
@@ -297,7 +306,7 @@ class Study:
                 if self.get(count, name) is not None:
                     shown.append((f'{method_of(name).label.replace("`", "")}, {count} views', self.volume(count, name)))
             for axis, (title, volume) in zip(block.flat, shown):
-                axis.imshow(volume[:, :, middle].T, cmap='gray', vmin=0, vmax=top, origin='lower')
+                axis.imshow(volume[:, :, volume.shape[2] // 2].T, cmap='gray', vmin=0, vmax=top, origin='lower')
                 axis.set_title(title, fontsize=9)
         path.parent.mkdir(parents=True, exist_ok=True)
         with replacing(path) as temporary:

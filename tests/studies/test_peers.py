@@ -18,7 +18,7 @@ from lingo_mi.metrics.quality import psnr_3d
 from lingo_mi.projectors import grid
 from lingo_mi.scan import Dataset, Scan
 from studies.benchmarks import mbirjax_bridge, rtk_bridge
-from studies.peers.study import Method, Study
+from studies.peers.study import METHODS, Method, Study
 
 SIZES = dict(DSO=200.0, DSD=300.0, dDetector=3.0)
 
@@ -52,6 +52,23 @@ def peers(monkeypatch, capsys, tmp_path, scan):
         return stop.value.code, *capsys.readouterr()
 
     return run
+
+
+def test_a_volume_of_smaller_voxels_is_judged_on_its_own_grid(monkeypatch, scan, tmp_path):
+    """Its views from the smaller voxels, and its means against the reference."""
+    dataset = Dataset(read_scan(scan).train.on(Grid((16, 16, 16), (2.4, 2.4, 2.4))))
+    reference = Study(dataset, tmp_path / 'reference').reference()
+    for finer in (1, 2):
+        whole = np.kron(reference, np.ones((finer,) * 3, np.float32))
+        monkeypatch.setitem(METHODS, 'copy', Method('copy', lambda scan, whole=whole: whole))
+        study = Study(dataset, tmp_path / str(finer))
+        study.compute_missing(['copy'], [6])
+        cell = study.get(6, 'copy')
+        assert study.volume(6, 'copy').shape == (16 * finer,) * 3
+        views = dataset.train.subset([1, 3, 5, 7, 9, 11]).on(dataset.train.geometry.grid.finer(finer))
+        wrong = grid.project_volume(whole, views.geometry) - views.projections
+        assert cell['held_out_rms'] == pytest.approx(np.sqrt(np.mean(np.square(wrong))), rel=1e-4)
+        assert cell['psnr_3d'] > 60
 
 
 def test_numbers_and_that_they_are_kept(peers, scan, tmp_path):
