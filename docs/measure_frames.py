@@ -1,4 +1,4 @@
-"""How long a frame of report.html takes in headless Chromium without a GPU: the table of the page `how_to/look.md`.
+"""How long a frame of report.html takes in headless Chromium without a GPU: the limits of the page `how_to/look.md`.
 
 pip install -e '.[browser]'
 lingo-mi fit x3d_foot
