@@ -18,11 +18,11 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING
 
-from lingo_mi.common.runtime import calm_openmp, find_libllvm, mend_llvm
+from lingo_mi.common.runtime import calm_openmp, find_libllvm, restart_llvm
 
 calm_openmp()  # before anything loads PyTorch
 find_libllvm()  # before anything loads Dr.Jit
-mend_llvm()  # or after it
+restart_llvm()  # or after it
 
 from lingo_mi.plugins import watch_variants  # noqa: E402 - loads Mitsuba, and Dr.Jit with it
 

@@ -133,9 +133,9 @@ class Scan:
         def blocks(values):
             return values[:, : rows * by[0], : columns * by[1]].reshape(len(self), rows, by[0], columns, by[1])
 
-        known = self.valid if self.effects is None else self.effects.masked(self).valid
+        mask = self.valid if self.effects is None else self.effects.masked(self).valid
         p = blocks(self.projections).mean((2, 4))
-        valid = None if known is None else blocks(known).all((2, 4))
+        valid = None if mask is None else blocks(mask).all((2, 4))
         effects = self.effects and self.effects.binned(by[0] * by[1])
         return replace(self, geometry=geometry, projections=p, valid=valid, effects=effects)
 
@@ -176,11 +176,11 @@ class Scan:
         """Tells scans apart, to know stored work again: 32 characters of voxels, rays, projections and valid pixels."""
         geometry, rays = self.geometry, self.geometry.rays(curved=True)
         numbers = geometry.grid.shape, geometry.grid.spacing, geometry.grid.centre, geometry.nDetector
-        found = hashlib.blake2b(repr(numbers).encode(), digest_size=16)
+        hasher = hashlib.blake2b(repr(numbers).encode(), digest_size=16)
         bend = None if rays.curve is None else rays.curve.numbers
         for array in (rays.source, rays.corner, rays.u, rays.v, bend, self.projections, self.valid):
-            found.update(b'' if array is None else np.ascontiguousarray(array).data)
-        return found.hexdigest()
+            hasher.update(b'' if array is None else np.ascontiguousarray(array).data)
+        return hasher.hexdigest()
 
     @property
     def normalised(self) -> np.ndarray:

@@ -14,7 +14,7 @@ from lingo_mi.geometry import CircularGeometry, CurvedGeometry, Geometry
 from lingo_mi.projectors.view import View
 from lingo_mi.scan import Dataset
 from lingo_mi.scene.data_files import data_file
-from lingo_mi.scene.description import NAMES, describe, own_grid, parameter, read_scanner
+from lingo_mi.scene.description import NAMES, describe, grid_from, parameter, read_scanner
 
 
 class CTScanner(mi.Sensor):
@@ -94,7 +94,7 @@ class CTScanner(mi.Sensor):
     def __init__(self, props):
         self.dataset = None
         try:
-            films: dict[str, Any] = {name: thing for name, thing in props.objects() if isinstance(thing, mi.Film)}
+            films: dict[str, Any] = {name: obj for name, obj in props.objects() if isinstance(obj, mi.Film)}
             self.detector = next((f.detector for f in films.values() if hasattr(f, 'detector')), None)
             if len(films) > (self.detector is not None):
                 raise InputError(
@@ -131,14 +131,14 @@ class CTScanner(mi.Sensor):
     @staticmethod
     def _measured(name, props):
         """A file of projections, on the voxels that the scene names."""
-        found = read_scan(data_file(name, 'projections'))
-        if found.volume is not None:  # the true one, on the file's own voxels
-            return found
+        dataset = read_scan(data_file(name, 'projections'))
+        if dataset.volume is not None:  # the true one, on the file's own voxels
+            return dataset
 
         def on_grid(scan):
-            return scan.on(own_grid(props, scan.geometry.grid))
+            return scan.on(grid_from(props, scan.geometry.grid))
 
-        return Dataset(on_grid(found.train), found.test and on_grid(found.test))
+        return Dataset(on_grid(dataset.train), dataset.test and on_grid(dataset.test))
 
     @property
     def frame(self) -> View:

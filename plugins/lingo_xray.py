@@ -152,8 +152,8 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
         film.prepare([])
         channels = film.develop().shape[2]
         images = []
-        for one, view in views_of(sensor):
-            effects = find_effects(scene, one)
+        for bundle, view in views_of(sensor):
+            effects = find_effects(scene, bundle)
             if effects is None:
                 total = self._ideal(find_objects(scene), view, primal)
             else:
@@ -170,8 +170,8 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
         """Line integrals, or transmissions, of every pixel of a scene without effects."""
         rays = self.options.subdivided(view)
         total = dr.zeros(mi.Float, rays.height * rays.width)
-        for thing in objects:
-            total += thing.line_integrals(rays, self.options, primal)
+        for obj in objects:
+            total += obj.line_integrals(rays, self.options, primal)
         if self.output == 'transmission':
             total = dr.exp(-total)
         return self.options.averaged(total, view)

@@ -97,10 +97,10 @@ class XRayTube(mi.Emitter):
                 k.removeprefix('material_'): props[k] for k in names if k.startswith('material_')
             }
             scatter = Scatter.of(*(props.get(k, d) for k, d in _SCATTER.items()))
-            given: dict[str, Any] = {
+            parameters: dict[str, Any] = {
                 f.name: props.get(f.name, f.default) for f in fields(TubeParameters) if f.name != 'materials'
             }
-            tube = Tube.of(TubeParameters(**given, materials=materials))
+            tube = Tube.of(TubeParameters(**parameters, materials=materials))
         except InputError as error:
             raise InputError(f'xray_tube {props.id()!r}: {error}') from None
         super().__init__(props)

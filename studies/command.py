@@ -20,7 +20,7 @@ def run_study(name: str, main: Callable[[], int | None]) -> None:
 
 
 @contextmanager
-def renewed_table(file: Path, table: Callable[[], str]) -> Iterator[Callable[[str], None]]:
+def updated_table(file: Path, table: Callable[[], str]) -> Iterator[Callable[[str], None]]:
     """The table of a study that stores its cells one by one, as Markdown in a file whose folder is locked meanwhile.
 
     Gives a function to call with a line after each cell: it prints the line and writes the table anew, with its provenance. At

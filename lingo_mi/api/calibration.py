@@ -11,7 +11,7 @@ from lingo_mi.calibration.search import search
 from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.common.parsing import whole_number
 from lingo_mi.common.progress import Progress
-from lingo_mi.common.runtime import ensure_variant, one_at_a_time
+from lingo_mi.common.runtime import drjit_lock, ensure_variant
 from lingo_mi.inspection.air import air_of, steady
 from lingo_mi.inspection.measure import warn_of_intensities
 from lingo_mi.reconstruction.line_integrals import line_integrals
@@ -24,7 +24,7 @@ NO_AIR = (
 )
 
 
-@one_at_a_time()
+@drjit_lock()
 def calibrate(
     scan: Scan | Dataset,
     *,

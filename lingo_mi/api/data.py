@@ -13,7 +13,7 @@ from lingo_mi.common.arrays import as_numpy
 from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.common.parsing import nearest, whole_number
 from lingo_mi.common.progress import Progress
-from lingo_mi.common.runtime import ensure_variant, one_at_a_time
+from lingo_mi.common.runtime import drjit_lock, ensure_variant
 from lingo_mi.files.scans import read_scan
 from lingo_mi.geometry import Geometry
 from lingo_mi.geometry.trajectories import spread
@@ -31,7 +31,7 @@ from lingo_mi.scene.simulate import choose_views, take_scan
 from lingo_mi.storage.file_access import as_path
 
 
-@one_at_a_time()
+@drjit_lock()
 def simulate(
     source: str | PathLike | Phantom | np.ndarray,
     geometry: Geometry | None = None,
@@ -75,7 +75,7 @@ def simulate(
     ------
     InputError
         If the source is unknown, does not fit the geometry, needs more memory than there is, or is a volume whose negative values
-        look like Hounsfield units (`docs/how_to/own_volume.md` says how to convert them).
+        look like Hounsfield units (`docs/how_to/scan_volume.md` says how to convert them).
 
     Examples
     --------
@@ -85,9 +85,9 @@ def simulate(
     ensure_variant()
     seed = parsing.seed(seed)
     views = 0 if views is None else whole_number('views', views, 1)
-    for name, given in (('geometry', geometry), ('held_out', held_out)):
-        if given is not None:
-            require_type(name, given, Geometry, 'such as lm.Geometry.cone(...)')
+    for name, argument in (('geometry', geometry), ('held_out', held_out)):
+        if argument is not None:
+            require_type(name, argument, Geometry, 'such as lm.Geometry.cone(...)')
     if parameters is not None:
         require_type('parameters', parameters, dict)
     if isinstance(source, (str, PathLike)):
@@ -208,9 +208,11 @@ def load_raw(
     require_type('frames', frames, (str, PathLike))
     if geometry is not None:
         require_type('geometry', geometry, (str, PathLike, Geometry))
-    known = {field.name for field in dataclasses.fields(Options)}
-    for name in options.keys() - known:
-        raise InputError(f'load_raw has no option {name!r}{nearest(name, known)}; it has {", ".join(sorted(known))}')
+    accepted = {field.name for field in dataclasses.fields(Options)}
+    for name in options.keys() - accepted:
+        raise InputError(
+            f'load_raw has no option {name!r}{nearest(name, accepted)}; it has {", ".join(sorted(accepted))}'
+        )
     return import_raw(frames, geometry, Options(**options), progress)[0]
 
 

@@ -106,23 +106,23 @@ def estimate(
         memory = room_needed(geometry, work, len(geometry), 0 if isinstance(scan, Geometry) else mask_images(scan))
     else:
         memory = least_memory(geometry, len(geometry))
-    found = Estimate(float(memory), float(room()))
+    result = Estimate(float(memory), float(room()))
     if trial is None:
-        return found
-    _check_trial(scan, work, trial, found)
+        return result
+    _check_trial(scan, work, trial, result)
     assert isinstance(scan, Scan)
-    return Estimate(found.memory, found.room, _tried(scan, work, float(trial)))
+    return Estimate(result.memory, result.room, _tried(scan, work, float(trial)))
 
 
-def _check_trial(scan: Scan | Geometry, work: Algorithm | Method, trial: Any, found: Estimate) -> None:
+def _check_trial(scan: Scan | Geometry, work: Algorithm | Method, trial: Any, result: Estimate) -> None:
     if isinstance(trial, bool) or not (isinstance(trial, Real) and 0 < float(trial) < float('inf')):
         raise InputError(f'trial is a time in seconds, above 0, not {shown(trial)}')
     if isinstance(scan, Geometry):
         raise InputError('a trial works on projections: give the scan, not its geometry alone')
     if isinstance(work, Refined):
         raise InputError('refined starts from a fitted cloud, so that it cannot be tried: leave out trial')
-    if not found.fits:
-        raise InputError(f'the trial does not fit into memory, {found!r}: lower nVoxel, nDetector or the views')
+    if not result.fits:
+        raise InputError(f'the trial does not fit into memory, {result!r}: lower nVoxel, nDetector or the views')
 
 
 class _Enough(Exception):

@@ -135,7 +135,7 @@ def fit(
             def measure(fit: Fit) -> dict:
                 fit = fit.with_data(few)
                 numbers = quick_measure(fit)
-                watch.look(fit, numbers)
+                watch.snapshot(fit, numbers)
                 return numbers
 
             result = run(dataset.train, chosen, seed, measure=measure, progress=between, path=checkpoint, resume=resume)

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from lingo_mi.common.arrays import as_numpy
 from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.common.parsing import whole_number
-from lingo_mi.common.runtime import ensure_variant, one_at_a_time
+from lingo_mi.common.runtime import drjit_lock, ensure_variant
 from lingo_mi.completion.prepare import fit_cloud, prepare_completed, prepare_start
 from lingo_mi.effects.forward import effects_of
 from lingo_mi.files.slabs import THICKNESS, check_volume_name, plan_and_error_map, require_whole_chunks
@@ -66,7 +66,7 @@ def reconstruct(
 ) -> Path: ...
 
 
-@one_at_a_time()
+@drjit_lock()
 def reconstruct(
     scan: Scan | Dataset,
     algorithm: Algorithm,
@@ -169,10 +169,10 @@ def reconstruct(
                 run_in_slabs(scan, algorithm, path, slab, bar, runner, unit)
             return path
         with progress_bar(algorithm, scan, shown=progress) as bar:
-            found = run_algorithm(scan, algorithm, progress=bar, **inputs)
+            result = run_algorithm(scan, algorithm, progress=bar, **inputs)
         if path is not None:
-            found.save(path, units=units, mu_water=mu_water, force=force)
-    return found
+            result.save(path, units=units, mu_water=mu_water, force=force)
+    return result
 
 
 def _start(start: Any) -> Fit | np.ndarray | None:

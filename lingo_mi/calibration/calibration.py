@@ -8,7 +8,7 @@ from typing import overload
 import numpy as np
 
 from lingo_mi.calibration.response.response import Response
-from lingo_mi.calibration.search import Found
+from lingo_mi.calibration.search import SearchResult
 from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.inspection.air import Air, without_air
@@ -31,7 +31,7 @@ class Calibration:
     ----------
     geometry : Geometry
         Of the scan that was given.
-    found : Found
+    found : SearchResult
         Numbers, their standard errors, and how well views predict each other before and after.
     air : Air or None
         The air level that was read beside the object and taken out first; None if none was.
@@ -40,7 +40,7 @@ class Calibration:
     """
 
     geometry: Geometry
-    found: Found
+    found: SearchResult
     air: Air | None = None
     notes: tuple[str, ...] = ()
 

@@ -49,8 +49,8 @@ def _binned(scan: Scan, factor: int) -> Scan:
         return scan.binned(factor)
     valid = scan.valid.astype(np.float32)
     sums, share = (replace(scan, projections=p, valid=None).binned(factor) for p in (scan.projections * valid, valid))
-    known = share.projections >= 0.5
-    return replace(sums, projections=sums.projections / np.maximum(share.projections, 0.5), valid=known)
+    half_valid = share.projections >= 0.5
+    return replace(sums, projections=sums.projections / np.maximum(share.projections, 0.5), valid=half_valid)
 
 
 def _smoothed(scan):
@@ -62,9 +62,9 @@ def _smoothed(scan):
     by = [0.0, *(SMOOTH if n > 2 else 0.0 for n in scan.geometry.nDetector)]
     beyond = [(0, 0), *((min(BEYOND, n - 1) if n > 2 else 0,) * 2 for n in scan.geometry.nDetector)]
     inside = tuple(slice(k, k + n) for (k, _), n in zip(beyond, scan.projections.shape))
-    known = np.pad(valid, beyond, 'reflect')
-    wider = np.pad(scan.projections, beyond, 'reflect', reflect_type='odd') * known
-    values, weights = (ndimage.gaussian_filter(x, by, mode='nearest')[inside] for x in (wider, known))
+    weight = np.pad(valid, beyond, 'reflect')
+    wider = np.pad(scan.projections, beyond, 'reflect', reflect_type='odd') * weight
+    values, weights = (ndimage.gaussian_filter(x, by, mode='nearest')[inside] for x in (wider, weight))
     return values / np.maximum(weights, 1e-3)
 
 

@@ -22,19 +22,19 @@ def scan_times(geometry: Geometry, angles: np.ndarray) -> np.ndarray:
     n = len(geometry)
     if len(angles) == n and np.array_equal(angles, geometry.angles):
         return np.linspace(-1, 1, n) if n > 1 else np.zeros(1)
-    own = np.asarray(geometry.angles, float)
-    if not _in_order(own):
-        own = np.unwrap(own)
-    turns = np.diff(own)
-    if n < 2 or not _in_order(own):
+    scan_angles = np.asarray(geometry.angles, float)
+    if not _in_order(scan_angles):
+        scan_angles = np.unwrap(scan_angles)
+    turns = np.diff(scan_angles)
+    if n < 2 or not _in_order(scan_angles):
         return np.linspace(-1, 1, len(angles)) if len(angles) > 1 else np.zeros(len(angles))
-    known, x = np.abs(own - own[0]), np.sign(turns[0]) * (angles - own[0])
-    if known[-1] < 2 * np.pi:  # a view whose angle is none between them came after the last
+    turned, x = np.abs(scan_angles - scan_angles[0]), np.sign(turns[0]) * (angles - scan_angles[0])
+    if turned[-1] < 2 * np.pi:  # a view whose angle is none between them came after the last
         x = np.mod(x + NEAR, 2 * np.pi) - NEAR
     elif x.min() < -NEAR or np.ptp(geometry.angles) < 2 * np.pi:  # angles that do not count the turns
         x = _counted(np.mod(x + NEAR, 2 * np.pi) - NEAR)
     step = 2 / (n - 1)
-    ends = np.append(known, known[-1] + np.median(np.abs(turns)))
+    ends = np.append(turned, turned[-1] + np.median(np.abs(turns)))
     return np.interp(x, ends, np.append(np.linspace(-1, 1, n), 1 + step))
 
 

@@ -50,8 +50,8 @@ def order_faults(scan: Scan) -> list[str]:
     index = np.unique(np.round(np.linspace(0, n - 1, min(n, MOST_VIEWS))).astype(int))
     small = coarse(steady(scan)[0].subset(index), PIXELS)
     turn, shuffled = np.arange(len(index))[::-1], np.random.default_rng(0).permutation(len(index))
-    given = _differences(small)
-    total = np.sqrt(np.square(given).mean())
+    differences = _differences(small)
+    total = np.sqrt(np.square(differences).mean())
     signal = np.sqrt(np.square(small.projections).mean())
 
     def times(order):
@@ -70,8 +70,8 @@ def order_faults(scan: Scan) -> list[str]:
             'angles, or mirror the columns'
         ]
     # What is wrong with the geometry grows and falls slowly from view to view; a view out of place stands out of its neighbours.
-    others = ndimage.median_filter(given, NEIGHBOURS, mode='mirror')
-    odd = index[given > ODD * np.maximum(np.median(given), others)]
+    others = ndimage.median_filter(differences, NEIGHBOURS, mode='mirror')
+    odd = index[differences > ODD * np.maximum(np.median(differences), others)]
     if not len(odd):
         return []
     named = ', '.join(map(str, odd[:6])) + (', ...' if len(odd) > 6 else '')

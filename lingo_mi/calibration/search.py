@@ -45,7 +45,7 @@ FLOOR = 0.03  # of a step for differences: no standard error is smaller, since v
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """What the search has found.
 
     Parameters
@@ -87,27 +87,27 @@ class _Level:
     def differences(self, numbers: dict[str, float]) -> np.ndarray:
         """Measured less predicted, [view, v, u], zero where it does not count."""
         places = {name: value for name, value in numbers.items() if name[0] in 'uvy'}
-        given = self.scan.geometry
-        scan = replace(self.scan, geometry=Drift.of(given, places).panel(given).moved(given))
+        geometry = self.scan.geometry
+        scan = replace(self.scan, geometry=Drift.of(geometry, places).panel(geometry).moved(geometry))
         measured = scan.projections
         if self.response is None:
             expected = cross_predicted(scan, self.folds)
         else:
             response = self.response.changed(numbers)
-            expected = cross_predicted(replace(scan, projections=response.undone(measured, given)), self.folds)
-            expected = response.applied(expected, given)
+            expected = cross_predicted(replace(scan, projections=response.undone(measured, geometry)), self.folds)
+            expected = response.applied(expected, geometry)
         self.count()
         r = (measured - expected).astype(float)
         return r if scan.valid is None else np.where(scan.valid, r, 0)
 
     def derivatives(self, here: dict[str, float]) -> np.ndarray:
         """Of the differences, by central differences, of half a pixel for what moves: [number, view, v, u]."""
-        found = []
+        derivatives = []
         for name in self.names:
             h = self.steps[name]
             ends = [self.differences(here | {name: here[name] + sign * h}) for sign in (1, -1)]
-            found.append((ends[0] - ends[1]) / (2 * h))
-        return np.array(found)
+            derivatives.append((ends[0] - ends[1]) / (2 * h))
+        return np.array(derivatives)
 
     def stepped(self, here: dict[str, float], r: np.ndarray, D: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
         """A step of limited length, or half of it, or none: where the differences are smaller; and these."""
@@ -123,7 +123,7 @@ class _Level:
 
 def search(
     scan: Scan, degree: int = 0, response: Response | None = None, progress: Callable[[int, int], None] | None = None
-) -> Found:
+) -> SearchResult:
     """The panel's place, its drift over the scan, and a response of the detector.
 
     Parameters
@@ -172,7 +172,7 @@ def search(
         if here is before:
             break
     errors = dict(zip(names, map(float, np.maximum(_standard_errors(r, D, level), np.abs(_step(r, D))))))
-    given = level.differences(zero)
+    unchanged = level.differences(zero)
     small = [name for name in names if not abs(here[name]) > SURE * errors[name]]
     refused = dict.fromkeys(small, 'it is less than three standard errors')
     if not between:
@@ -183,23 +183,23 @@ def search(
     while True:
         sure = [name for name in names if name not in refused]
         if sure and len(sure) < len(names):  # once more, with the others as given
-            level.names, kept = sure, D[[names.index(name) for name in sure]]
+            level.names, rows = sure, D[[names.index(name) for name in sure]]
             chosen = zero | {name: here[name] for name in sure}
-            chosen, best = level.stepped(chosen, level.differences(chosen), kept)
+            chosen, best = level.stepped(chosen, level.differences(chosen), rows)
         doubted = response.doubts(chosen, {name: errors[name] for name in sure}) if response and sure else {}
         if not doubted:
             break
         refused = doubted | refused
-    if not sure or np.square(best).sum() >= np.square(given).sum():
-        chosen, best = zero, given
+    if not sure or np.square(best).sum() >= np.square(unchanged).sum():
+        chosen, best = zero, unchanged
         refused = dict.fromkeys(sure, 'views do not predict each other better') | refused
-    return Found(
+    return SearchResult(
         Drift.of(whole.geometry, {name: value for name, value in chosen.items() if name in _determined(scan, degree)}),
         response and response.changed(chosen),
         here,
         errors,
         refused,
-        float(np.sqrt(np.square(given).mean())),
+        float(np.sqrt(np.square(unchanged).mean())),
         float(np.sqrt(np.square(best).mean())),
     )
 

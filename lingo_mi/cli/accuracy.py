@@ -54,6 +54,6 @@ def main() -> None:
         print(f'{args.out}/: accuracy.json, accuracy.md')
         return
     begun = time.perf_counter()
-    found = measure(sizes, lambda part: print(f'{time.perf_counter() - begun:5.0f} s  {part}', file=sys.stderr))
-    write(found, args.out, figures, document, beside)
+    results = measure(sizes, lambda part: print(f'{time.perf_counter() - begun:5.0f} s  {part}', file=sys.stderr))
+    write(results, args.out, figures, document, beside)
     print(f'{args.out}/: accuracy.json, accuracy.md; {figures}/: pareto.png, scaling.png, fits.png')

@@ -80,14 +80,14 @@ def run_batch(args: argparse.Namespace, rows: list, done: dict) -> None:
     if done:
         print(f'{len(done)} of {len(rows)} scans are done already')
     with runner_of(args, args.out) as runner:
-        found = run_cohort(rows, args.out, runner, done)
+        table = run_cohort(rows, args.out, runner, done)
     width = max(len(row.name) for row in rows)
     print(f'{"":{width}s}  ' + '  '.join(f'{name:>11s}' for name in SHOWN))
-    for name, numbers in found.numbers.items():
+    for name, numbers in table.numbers.items():
         values = (numbers.get(key) for key in SHOWN)
         print(f'{name:{width}s}  ' + '  '.join(f'{"" if v is None else f"{v:.6g}":>11s}' for v in values))
-    for name, line in found.failed.items():
+    for name, line in table.failed.items():
         print(f'failed: {name}: {line}', file=sys.stderr)
-    print(', '.join(map(str, found.files)))
-    if found.failed:
-        raise InputError(f'{len(found.failed)} of {len(rows)} scans failed twice; the same command tries them again')
+    print(', '.join(map(str, table.files)))
+    if table.failed:
+        raise InputError(f'{len(table.failed)} of {len(rows)} scans failed twice; the same command tries them again')

@@ -55,9 +55,9 @@ def main() -> None:
     from lingo_mi.api.calibration import calibrate
     from lingo_mi.files.scans import history_of, read_scan, write_scan
 
-    found = read_scan(args.scan)
-    scan = found.train
-    if args.out is not None and (found.test is not None or found.volume is not None):
+    dataset = read_scan(args.scan)
+    scan = dataset.train
+    if args.out is not None and (dataset.test is not None or dataset.volume is not None):
         warnings.warn(
             f'{args.out}: holds the views to fit alone, not the held-out views or the volume of {args.scan}',
             stacklevel=2,

@@ -32,9 +32,9 @@ class Parser(argparse.ArgumentParser):
     running: ClassVar[tuple[Parser, argparse.Namespace] | None] = None
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        found = super().parse_known_args(args, namespace)
-        Parser.running = self, found[0]
-        return found
+        parsed = super().parse_known_args(args, namespace)
+        Parser.running = self, parsed[0]
+        return parsed
 
     def _check_value(self, action: argparse.Action, value: Any) -> None:
         try:
@@ -76,8 +76,8 @@ def guard(main: Callable[[], int | None]) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
     except OSError as error:
-        said = f'{f"{error.filename}: " if error.filename else ""}{error.strerror or error}'
-        print(f'error: {brief(said)}', file=sys.stderr)
+        text = f'{f"{error.filename}: " if error.filename else ""}{error.strerror or error}'
+        print(f'error: {brief(text)}', file=sys.stderr)
         sys.exit(2)
     except MemoryError as error:
         print(f'error: not enough memory ({brief(error, 250)})', file=sys.stderr)
@@ -103,8 +103,8 @@ def with_options(message: str) -> str:
         name, value = match[1], match[2].strip("'")
         parts = [part.strip() for part in value.strip('()').split(',')] if value.startswith('(') else [value]
         if (option := options.get(name)) is None:
-            known = 'define' in options and name in _settings(args)
-            return f'-D {name}={",".join(parts)}' if known else match[0]
+            is_setting = 'define' in options and name in _settings(args)
+            return f'-D {name}={",".join(parts)}' if is_setting else match[0]
         if option.nargs == 0:
             return option.option_strings[-1] if value == 'True' else match[0]
         several = len(parts) > 1 and option.nargs is None  # in one text, of a form of its own
@@ -119,8 +119,10 @@ def _settings(args: argparse.Namespace) -> set[str]:
     from lingo_mi.reconstruction import ALGORITHMS
     from lingo_mi.scene.load import defaults
 
-    options = [method.flat() for method in METHODS.values()] + [made().options for made in ALGORITHMS.values()]
-    names = {name for known in options for name in known}
+    options = [method.flat() for method in METHODS.values()] + [
+        algorithm().options for algorithm in ALGORITHMS.values()
+    ]
+    names = {name for part in options for name in part}
     for scene in [getattr(args, 'scene', None), *getattr(args, 'scenes', [])]:
         with suppress(InputError):
             names |= defaults(scene_path(scene)) if scene else set()
@@ -282,9 +284,9 @@ def check_scan_output(out: Path, inputs: Iterable[PathLike | str | None], force:
     if out.suffix != '.npy':
         raise InputError(f'{out}: a scan is written as .npy with a .yml beside it; give a name that ends in .npy')
     written = written_files(out)
-    for given in filter(None, inputs):
-        if Path(given).resolve() in [file.resolve() for file in written]:
-            raise InputError(f'{given}: would be overwritten by {out} or a file beside it; give --out another name')
+    for source in filter(None, inputs):
+        if Path(source).resolve() in [file.resolve() for file in written]:
+            raise InputError(f'{source}: would be overwritten by {out} or a file beside it; give --out another name')
     for file in written:
         if file.exists() and not force:
             raise InputError(f'{file}: exists already; give --force to overwrite it')

@@ -52,9 +52,9 @@ def main() -> None:
     if args.truth is None and (args.spacing or args.mu_water is not None):
         raise InputError('--spacing and --mu-water go with --truth')
     require_writable(args.out.parent, args.out)
-    found = [load_result(path) for path in args.results]
+    results = [load_result(path) for path in args.results]
     truth = read_volume(args.truth, args.mu_water, spacing=args.spacing) if args.truth else None
-    page = compare_page(found, truth, args.title)
+    page = compare_page(results, truth, args.title)
     with writing_file(args.out):
         write_text(args.out, page)
     print(args.out)

@@ -37,11 +37,11 @@ def whole_parser(files: Any) -> Parser:
     whole.add_argument('--print-completion', metavar='SHELL', help='a script that completes commands and options')
     commands = whole.add_subparsers(dest='command')
     for name, command in COMMANDS.items():
-        own = importlib.import_module(f'lingo_mi.cli.{command.module}').parser()
-        for action in own._actions:
+        subparser = importlib.import_module(f'lingo_mi.cli.{command.module}').parser()
+        for action in subparser._actions:
             if _names_a_file(action):
                 action.complete = files
-        commands.add_parser(name, parents=[own], add_help=False, help=command.does)
+        commands.add_parser(name, parents=[subparser], add_help=False, help=command.does)
     return whole
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lingo_mi.inspection.measure import Findings, said_of_intensities
+from lingo_mi.inspection.measure import Findings, intensity_warning
 from lingo_mi.scan import Scan
 
 CALIBRATE = '; lingo-mi calibrate finds an axis off centre all the same'
@@ -18,46 +18,47 @@ OBSTACLES = dict(
 )
 
 
-def facts(scan: Scan, found: Findings) -> list[str]:
+def facts(scan: Scan, findings: Findings) -> list[str]:
     """Sentences with the numbers that were measured."""
     geometry = scan.geometry
     (nv, nu), (dv, du) = geometry.nDetector, geometry.dDetector
     lengths = f', DSO {geometry.DSO:.5g} mm, DSD {geometry.DSD:.5g} mm' if geometry.mode == 'cone' else ''
     lines = [
         f'{len(scan)} views of {nv} x {nu} pixels of {dv:.4g} x {du:.4g} mm, {geometry.mode} beam{lengths}; '
-        f'{found.invalid:.2%} of the pixels are left out'
+        f'{findings.invalid:.2%} of the pixels are left out'
     ]
-    if found.intensities is not None:
+    if findings.intensities is not None:
         return lines
-    if (border := found.border) is not None:
+    if (border := findings.border) is not None:
         if border.air is None:
             lines.append('air: none beside the object, which fills the panel')
         else:
             lines.append(f'air: {border.air:.4g} beside the object (line integral; 0 without error)')
-        if (spread := _air_spread(found)) is not None:
+        if (spread := _air_spread(findings)) is not None:
             lines.append(f'air of the views: differs by {spread:.2g} rms')
-        for name, views in _cut(found):
+        for name, views in _cut(findings):
             lines.append(f'truncation: the object reaches over the {name} edge of the panel in {views} views')
-    if found.photons is None:
+    if findings.photons is None:
         lines.append('noise: none that could be measured')
     else:
         lines.append(
-            f'noise: {found.photons**-0.5:.2g} rms in air from column to column, as from {found.photons:.2g} photons a pixel'
+            f'noise: {findings.photons**-0.5:.2g} rms in air from column to column, as from {findings.photons:.2g} photons a '
+            'pixel'
         )
-    if found.clipped is not None:
+    if findings.clipped is not None:
         lines.append(
-            f'saturation: {found.clipped:.2%} of the pixels have exactly the highest value, {found.highest:.3g}'
+            f'saturation: {findings.clipped:.2%} of the pixels have exactly the highest value, {findings.highest:.3g}'
         )
-    if found.mass_spread is not None:
-        lines.append(f'mass: equal in all views to {found.mass_spread:.2%} rms')
-    jitter = [f'{x:.2g} pixels along {name}' for x, name in zip(found.jitter, ('rows', 'columns')) if np.isfinite(x)]
+    if findings.mass_spread is not None:
+        lines.append(f'mass: equal in all views to {findings.mass_spread:.2%} rms')
+    jitter = [f'{x:.2g} pixels along {name}' for x, name in zip(findings.jitter, ('rows', 'columns')) if np.isfinite(x)]
     if jitter:
         lines.append('jitter of the outline: ' + ', '.join(jitter))
-    return lines + _orbit(scan, found)
+    return lines + _orbit(scan, findings)
 
 
-def _orbit(scan, found):
-    orbit, lines = found.orbit, []
+def _orbit(scan, findings):
+    orbit, lines = findings.orbit, []
     if orbit.turn and len(scan) >= 4:
         lines.append(f'angles: {np.degrees(orbit.turn):.4g} degrees in all')
     if orbit.obstacle is not None:
@@ -76,66 +77,66 @@ def _orbit(scan, found):
     return lines
 
 
-def advice(scan: Scan, found: Findings) -> list[str]:
+def advice(scan: Scan, findings: Findings) -> list[str]:
     """Sentences that say what to correct, and how; none for a sound scan."""
-    border, lines = found.border, []
-    if found.text_order is not None:
+    border, lines = findings.border, []
+    if findings.text_order is not None:
         lines.append(
             'the views are sorted by their names as text, 10 before 2: sort them by number, as lingo-mi import does with frames; '
             'what is said here of views is of that order'
         )
-    if found.dead_columns:
+    if findings.dead_columns:
         lines.append(
-            f'{_named(found.dead_columns, "column")} dead, the same in all views: mark in the mask `valid`, as lingo-mi import '
-            'does with flat fields'
+            f'{_named(findings.dead_columns, "column")} dead, the same in all views: mark in the mask `valid`, as lingo-mi '
+            'import does with flat fields'
         )
-    if found.intensities is not None:
-        return [*lines, said_of_intensities(found.intensities)]
-    if found.negative:
+    if findings.intensities is not None:
+        return [*lines, intensity_warning(findings.intensities)]
+    if findings.negative:
         lines.append(
             'line integrals are negative: they look like ln(I / I0) (give -ln(I / I0)), or the flats had less exposure than the '
             'views (import with --exposure, or --air)'
         )
     if border is not None:
-        if found.air_is_off:
-            calibrated = '' if found.air is None else ', or take it out with lingo-mi calibrate SCAN --out F.npy'
+        if findings.air_is_off:
+            calibrated = '' if findings.air is None else ', or take it out with lingo-mi calibrate SCAN --out F.npy'
             lines.append(f'air is {border.air:.3g} instead of 0: import again with --air{calibrated}')
-        if found.air_differs:
+        if findings.air_differs:
             lines.append(
-                f'the air level of the views differs by {_air_spread(found):.2g} rms: import again with --air, which scales '
-                f'every view by its own air, fit with -D fit_air=view, or {_calibrated(found)}'
+                f'the air level of the views differs by {_air_spread(findings):.2g} rms: import again with --air, which scales '
+                f'every view by its own air, fit with -D fit_air=view, or {_calibrated(findings)}'
             )
-        for name, _ in _cut(found):
+        for name, _ in _cut(findings):
             lines.append(
                 f'{name} edge: make the volume (nVoxel) hold the object; fit --method lingo also needs -D outside=ignore'
             )
-    if found.clipped is not None:
+    if findings.clipped is not None:
         lines.append('pixels are clipped at the highest value: mark them in the mask `valid` (photon starvation)')
-    if found.black:
-        lines.append(f'{_named(found.black)} black or empty: drop with --views of import, or lm.Scan.subset')
-    if found.doubled:
+    if findings.black:
+        lines.append(f'{_named(findings.black)} black or empty: drop with --views of import, or lm.Scan.subset')
+    if findings.doubled:
         lines.append(
-            f'{_named(found.doubled)} the same as the one before: drop it, or correct the angles (a frame was stored twice)'
+            f'{_named(findings.doubled)} the same as the one before: drop it, or correct the angles (a frame was stored twice)'
         )
-    if found.mass_differs:
+    if findings.mass_differs:
         lines.append(
-            f'the mass of the views differs by {found.mass_spread:.1%} rms: the beam or the exposure drifts; import again with '
-            '--air, which scales every view by its own air'
+            f'the mass of the views differs by {findings.mass_spread:.1%} rms: the beam or the exposure drifts; import again '
+            'with --air, which scales every view by its own air'
         )
-    if found.unsteady:
+    if findings.unsteady:
         lines.append(
             'the object or the panel moves from view to view: fit with -D rate_pose=2e-3,2e-4, and keep it if the held-out views '
             'get better; lingo-mi calibrate --drift 3 measures a slow drift'
         )
-    return lines + _placement(scan, found)
+    return lines + _placement(scan, findings)
 
 
-def _placement(scan, found):
+def _placement(scan, findings):
     """What to correct in the geometry."""
-    orbit, lines = found.orbit, []
-    if found.wide:
+    orbit, lines = findings.orbit, []
+    if findings.wide:
         lines.append(
-            f'the panel of {max(scan.geometry.sDetector):.4g} mm is {found.wide:.2g} times as wide as its distance from the '
+            f'the panel of {max(scan.geometry.sDetector):.4g} mm is {findings.wide:.2g} times as wide as its distance from the '
             'source: give DSO, DSD and the size of the pixels in mm'
         )
     if orbit.turn == 0:
@@ -161,21 +162,21 @@ def _placement(scan, found):
     return lines
 
 
-def _air_spread(found):
+def _air_spread(findings):
     """Standard deviation of the air levels of the views; None if it is not known."""
-    return found.air.drift if found.air is not None else found.border.air_spread
+    return findings.air.drift if findings.air is not None else findings.border.air_spread
 
 
-def _calibrated(found):
+def _calibrated(findings):
     """How `calibrate` takes out a drift of the air level."""
-    if found.air is not None:
+    if findings.air is not None:
         return 'take it out with lingo-mi calibrate SCAN --out F.npy'
     return 'take out what is smooth in time with lingo-mi calibrate SCAN --air --out F.npy'
 
 
-def _cut(found):
+def _cut(findings):
     """The edges that the object reaches over, and in how many views."""
-    sides = ('left or right', found.border.cut_sides), ('upper or lower', found.border.cut_ends)
+    sides = ('left or right', findings.border.cut_sides), ('upper or lower', findings.border.cut_ends)
     return [(name, views) for name, views in sides if views]
 
 

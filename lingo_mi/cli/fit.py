@@ -96,24 +96,26 @@ def main() -> None:
     check_seed(args.seed)
     defined = definitions(args.define)
     args.scene = scene_path(args.scene)
-    own = defaults(args.scene)  # a name of the scene goes before an option's
-    method = method_of_arguments(args, {k: v for k, v in defined.items() if k not in own}, own)
+    scene_parameters = defaults(args.scene)  # a name of the scene goes before an option's
+    method = method_of_arguments(
+        args, {k: v for k, v in defined.items() if k not in scene_parameters}, scene_parameters
+    )
     folder = result_folder(args.out or Path('out') / input_name(args), force=args.force, resume=args.resume)
-    fit_scene(folder, args, method, {k: v for k, v in defined.items() if k in own})
+    fit_scene(folder, args, method, {k: v for k, v in defined.items() if k in scene_parameters})
 
 
-def method_of_arguments(args: argparse.Namespace, given: dict[str, str], of_scene: Collection[str]) -> Method:
+def method_of_arguments(args: argparse.Namespace, values: dict[str, str], of_scene: Collection[str]) -> Method:
     """The method of --method, --iterations, --start and the -D values that are not the scene's."""
     options = {k: v for k, v in (('iterations', args.iterations), ('start', args.start)) if v is not None}
-    if twice := given.keys() & options.keys():
+    if twice := values.keys() & options.keys():
         raise InputError(f'--{min(twice)} and -D {min(twice)} say the same: leave one of them out')
-    options |= given
-    known = known_options(args.method, options)
-    if unknown := [name for name in given if name not in known]:
+    options |= values
+    accepted = known_options(args.method, options)
+    if unknown := [name for name in values if name not in accepted]:
         names = ', '.join(sorted(of_scene)) or 'it has none'
         raise InputError(
             f'-D {unknown[0]}: neither a parameter of {args.scene} ({names}) nor an option of {args.method}'
-            + (nearest(unknown[0], [*of_scene, *known]) or '; the documentation of the methods lists those')
+            + (nearest(unknown[0], [*of_scene, *accepted]) or '; the documentation of the methods lists those')
         )
     return method_of(args.method, **options)
 

@@ -40,9 +40,9 @@ def main() -> None:
     from lingo_mi.inspection.sheet import draw
 
     scan = read_scan(args.scan).train
-    found = measure(scan)
-    measured, wrong = facts(scan, found), advice(scan, found)
-    if not found.misplaced and not found.suspects and found.intensities is None:
+    findings = measure(scan)
+    measured, wrong = facts(scan, findings), advice(scan, findings)
+    if not findings.misplaced and not findings.suspects and findings.intensities is None:
         faults, obstacle = _compare_views(scan)
         measured, wrong = measured + obstacle, wrong + faults
     print('\n'.join(measured))
@@ -50,7 +50,7 @@ def main() -> None:
     for line in wrong:
         print(f'- {line}')
     out.parent.mkdir(parents=True, exist_ok=True)
-    draw(out, scan, found)
+    draw(out, scan, findings)
     print(f'\n{out}')
 
 

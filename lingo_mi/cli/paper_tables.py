@@ -127,7 +127,7 @@ def make_tables(
                 'are no densities; add other --algorithms or --methods'
             )
     with locked(folder):
-        failed = [one for table in tables for one in _make(args, table, every, rows[table], objects, name)]
+        failed = [failure for table in tables for failure in _make(args, table, every, rows[table], objects, name)]
     if failed:
         cell, error, planned = failed[0]
         raise InputError(f'{len(failed)} of {planned} cells failed, the first one ({cell}): {error}')

@@ -147,7 +147,7 @@ def write_ply(path: Path, phantom: phantoms.Phantom) -> None:
     analytic: Any = phantom.analytic  # of the class of its own module
     scale = 1.0
     if isinstance(analytic, phantoms.Scaled):
-        analytic, scale = analytic.thing, analytic.factor
+        analytic, scale = analytic.analytic, analytic.factor
     if phantom.name == 'gaussians':
         from lingo_mi.files.ply import write_ply
 

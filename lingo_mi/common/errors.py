@@ -48,14 +48,14 @@ class AccuracyWarning(UserWarning):
     """Float32 cannot give this result to the usual digits. The message says why, and about how many are left."""
 
 
-def require_type(name: str, value: object, kinds: type | tuple[type, ...], mend: str = '') -> None:
+def require_type(name: str, value: object, kinds: type | tuple[type, ...], remedy: str = '') -> None:
     """Raises InputError unless `value` is of one of `kinds`.
 
     Parameters
     ----------
     name : str
         Of the argument, for the message.
-    mend : str
+    remedy : str
         What to do, for the message.
 
     Examples
@@ -64,4 +64,4 @@ def require_type(name: str, value: object, kinds: type | tuple[type, ...], mend:
     """
     if not isinstance(value, kinds):
         wanted = ' or '.join(f'a {kind.__name__}' for kind in (kinds if isinstance(kinds, tuple) else (kinds,)))
-        raise InputError(f'{name} must be {wanted}, not {type(value).__name__}' + (f'; {mend}' if mend else ''))
+        raise InputError(f'{name} must be {wanted}, not {type(value).__name__}' + (f'; {remedy}' if remedy else ''))

@@ -101,10 +101,10 @@ def visible_gpus() -> list[str]:
     count = ctypes.c_int()
     try:
         driver = ctypes.CDLL(_driver())
-        known = driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
+        counted = driver.cuInit(0) == 0 and driver.cuDeviceGetCount(ctypes.byref(count)) == 0
     except OSError:
         return []
-    return [str(i) for i in range(count.value)] if known else []
+    return [str(i) for i in range(count.value)] if counted else []
 
 
 def _driver() -> str:

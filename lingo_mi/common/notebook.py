@@ -58,7 +58,7 @@ def frames(
     scale = SIDE / max(rows, columns)
     width, height = max(LEAST, round(columns * scale)), max(LEAST, round(rows * scale))
     first = int(np.abs(chosen - (count // 2 if start is None else start)).argmin())
-    said = [html.escape(str(labels[i])).replace('|', '/') for i in chosen]
+    captions = [html.escape(str(labels[i])).replace('|', '/') for i in chosen]
     act = (
         f"this.previousElementSibling.style.backgroundPositionY=-{height}*this.value+'px';"
         "this.nextElementSibling.value=this.dataset.labels.split('|')[this.value]"
@@ -66,7 +66,7 @@ def frames(
     name = html.escape(title)
     slider = (
         f'<input type="range" min="0" max="{len(chosen) - 1}" value="{first}" aria-label="{name}" style="width:{width}px" '
-        f'data-labels="{"|".join(said)}" oninput="{act}">'
+        f'data-labels="{"|".join(captions)}" oninput="{act}">'
     )
     return (
         f'<figure style="display:inline-block;vertical-align:top;margin:0 1em .5em 0;width:{max(width, SIDE)}px">'
@@ -74,7 +74,7 @@ def frames(
         f'<div role="img" aria-label="{name}" style="width:{width}px;height:{height}px;'
         f'background-size:{width}px {height * len(chosen)}px;'
         f'background-position-y:{-height * first}px;background-image:url(data:image/png;base64,{sprite})"></div>'
-        f'{slider if len(chosen) > 1 else ""}<output style="display:block;font-size:.9em">{said[first]}</output></figure>'
+        f'{slider if len(chosen) > 1 else ""}<output style="display:block;font-size:.9em">{captions[first]}</output></figure>'
     )
 
 

@@ -124,9 +124,9 @@ def require_ranges(part: Any, **ranges: tuple[float, float]) -> None:
             raise InputError(f'{f.name} must lie in [{least:g}, {most:g}], not {shown(value)}')
 
 
-def nearest(name: str, known: Iterable[str]) -> str:
+def nearest(name: str, names: Iterable[str]) -> str:
     """', did you mean ...?' of the known name nearest to a misspelt one, for messages; empty where none is near."""
-    near = difflib.get_close_matches(name, list(known), 1)
+    near = difflib.get_close_matches(name, list(names), 1)
     return f', did you mean {near[0]}?' if near else ''
 
 

@@ -34,11 +34,11 @@ _LOCK = threading.RLock()
 
 
 @contextmanager
-def one_at_a_time() -> Iterator[None]:
+def drjit_lock() -> Iterator[None]:
     """Holds up other threads: recorded kernels serve one at a time, and two threads in Dr.Jit may wait for each other for ever.
 
     Tells Dr.Jit of a thread that goes on with another's arrays: PyTorch goes back through a graph on a GPU in a thread of its
-    own. Also a decorator: `@one_at_a_time()`.
+    own. Also a decorator: `@drjit_lock()`.
     """
     import drjit as dr
 
@@ -78,9 +78,9 @@ def find_libllvm() -> str | None:
     roots = dict.fromkeys((sys.prefix, *(str(above) for p in packages for above in p.parents[2:3])))
     carried = ([os.path.join(root, pattern) for pattern in _IN_ENVIRONMENT.get(sys.platform, _LINUX)] for root in roots)
     for places in *carried, [_INSTALLED.get(sys.platform, '')]:
-        found = [path for place in places for path in glob.glob(place) if _numbers(path)[:1] >= [OLDEST_LLVM]]
-        if found:
-            os.environ['DRJIT_LIBLLVM_PATH'] = max(found, key=_numbers)
+        libraries = [path for place in places for path in glob.glob(place) if _numbers(path)[:1] >= [OLDEST_LLVM]]
+        if libraries:
+            os.environ['DRJIT_LIBLLVM_PATH'] = max(libraries, key=_numbers)
             return os.environ['DRJIT_LIBLLVM_PATH']
     return None
 
@@ -114,7 +114,7 @@ def warn_of_spinning() -> None:
         )
 
 
-def mend_llvm() -> None:
+def restart_llvm() -> None:
     """Where Dr.Jit was imported before us and took an LLVM that cannot work, restart it on the bundled one.
 
     Dr.Jit loads LLVM as soon as it is imported, so that `import mitsuba` before `import lingo_mi` meets a system LLVM first.

@@ -89,13 +89,13 @@ def at_turns(geometry: Geometry, angles: np.ndarray) -> Geometry:
     """
     if isinstance(geometry, CircularGeometry):
         return replace(geometry, angles=angles)
-    rays, own = geometry.rays(curved=True), turns(geometry)
+    rays, view_turns = geometry.rays(curved=True), turns(geometry)
 
     def turned(to):
         first = rays[np.zeros(len(to), int)]
-        return first.moved(Rotation.from_rotvec(np.outer(to - own[0], [0, 0, 1])).as_matrix())
+        return first.moved(Rotation.from_rotvec(np.outer(to - view_turns[0], [0, 0, 1])).as_matrix())
 
-    if np.abs(turned(own).vectors - rays.vectors).max() > SAME * np.abs(rays.vectors).max():
+    if np.abs(turned(view_turns).vectors - rays.vectors).max() > SAME * np.abs(rays.vectors).max():
         raise InputError('the completion of a scan needs a source on a circle about z; this scan has other poses')
     return Geometry.from_poses(turned(angles), geometry.nDetector, grid=geometry.grid)
 

@@ -139,10 +139,10 @@ def _band(signal, ratios, materials, count, largest):
         gtol=1e-14,
         max_nfev=MOST_STEPS,
     ).x
-    weights, found = unpacked(x)
+    weights, energies = unpacked(x)
     fine = _points(materials, 11) * reach
-    worst = np.abs(_hardened(fine, weights, found) - _hardened(fine, signal, ratios)).max()
-    return Bands(weights, found, float(worst))
+    worst = np.abs(_hardened(fine, weights, energies) - _hardened(fine, signal, ratios)).max()
+    return Bands(weights, energies, float(worst))
 
 
 def _hardened(points, weights, ratios):

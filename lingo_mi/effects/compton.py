@@ -40,8 +40,10 @@ def klein_nishina(cosine: ArrayLike, energy: float, response: str = 'count') -> 
         Atomic Nucleus", 1955, ch. 23); 'count' weights it by 1.
     """
     cosine = np.asarray(cosine, float)
-    kept = 1 / (1 + energy / ELECTRON * (1 - cosine))
-    return 0.5 * kept ** (3 if response == 'energy' else 2) * (kept + 1 / kept - (1 - cosine**2))
+    energy_share = 1 / (1 + energy / ELECTRON * (1 - cosine))
+    return (
+        0.5 * energy_share ** (3 if response == 'energy' else 2) * (energy_share + 1 / energy_share - (1 - cosine**2))
+    )
 
 
 @lru_cache(maxsize=64)
@@ -68,7 +70,7 @@ def scattering(energy: float, material: str = '', response: str = 'count') -> tu
     if not LEAST_ENERGY <= energy <= MOST_ENERGY:
         raise InputError(f'energy must be from {LEAST_ENERGY:g} to {MOST_ENERGY:g} keV, not {energy:g}')
     if not material:
-        return _kept(klein_nishina(np.linspace(-1, 1, CELLS + 1), energy, response))
+        return _cached(klein_nishina(np.linspace(-1, 1, CELLS + 1), energy, response))
     formula, density = compound(material)
     xraylib = library('xraylib')
     half = np.linspace(0, 1, _FINE + 1)[::-1] ** 2  # sin(theta / 2), which resolves a forward peak
@@ -78,8 +80,8 @@ def scattering(energy: float, material: str = '', response: str = 'count') -> tu
         for function in (xraylib.DCS_Compt_CP, xraylib.DCS_Rayl_CP)
     )
     cosine = 1 - 2 * half**2
-    kept = 1 / (1 + energy / ELECTRON * (1 - cosine)) if response == 'energy' else 1.0
-    fine = (bound * kept + coherent) * density / 10  # cm2/g to 1/mm
+    energy_share = 1 / (1 + energy / ELECTRON * (1 - cosine)) if response == 'energy' else 1.0
+    fine = (bound * energy_share + coherent) * density / 10  # cm2/g to 1/mm
     # Means over cells keep the integral of a forward peak narrower than a cell. The density is linear between fine angles, so
     # its integral is a parabola.
     edges = np.concatenate([[-1.0], (np.arange(CELLS) + 0.5) * (2 / CELLS) - 1, [1.0]])
@@ -87,9 +89,9 @@ def scattering(energy: float, material: str = '', response: str = 'count') -> tu
     i = np.clip(np.searchsorted(cosine, edges, 'right') - 1, 0, _FINE - 1)
     step = edges - cosine[i]
     slope = (fine[i + 1] - fine[i]) / (cosine[i + 1] - cosine[i])
-    return _kept(np.diff(below[i] + step * (fine[i] + step * slope / 2)) / np.diff(edges))
+    return _cached(np.diff(below[i] + step * (fine[i] + step * slope / 2)) / np.diff(edges))
 
 
-def _kept(table):
+def _cached(table):
     table.setflags(write=False)  # it is shared
     return table, float(4 * np.pi / CELLS * (table.sum() - (table[0] + table[-1]) / 2))

@@ -71,7 +71,7 @@ class Detector:
     corrected: bool = True
 
     @staticmethod
-    def of(**given: Any) -> Detector:
+    def of(**parameters: Any) -> Detector:
         """Checked parameters. Raises InputError."""
         ranges = dict(
             photons=MOST_PHOTONS,
@@ -83,21 +83,21 @@ class Detector:
             gain=1.0,
         )
         for name, most in ranges.items():
-            value = given[name]
+            value = parameters[name]
             if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= most:
                 raise InputError(f'{name} must be a number from 0 to {most:g}, not {value!r}')
         for name, most in dict(bits=24, seed=MOST_SEED).items():
-            value = given[name]
+            value = parameters[name]
             if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
                 raise InputError(f'{name} must be a whole number from 0 to {most}, not {value!r}')
-        if given['response'] not in RESPONSES:
-            raise InputError(f"response must be 'energy' or 'count', not {given['response']!r}")
-        if not isinstance(given['corrected'], bool):
-            raise InputError(f'corrected must be true or false, not {given["corrected"]!r}')
-        if given['electronic_noise'] and not given['photons']:
+        if parameters['response'] not in RESPONSES:
+            raise InputError(f"response must be 'energy' or 'count', not {parameters['response']!r}")
+        if not isinstance(parameters['corrected'], bool):
+            raise InputError(f'corrected must be true or false, not {parameters["corrected"]!r}')
+        if parameters['electronic_noise'] and not parameters['photons']:
             raise InputError('electronic_noise, in photons, needs photons')
-        checked_order(given['aperture_order'], 'aperture_order')
-        return Detector(**given)
+        checked_order(parameters['aperture_order'], 'aperture_order')
+        return Detector(**parameters)
 
     @property
     def measures(self) -> bool:

@@ -87,7 +87,9 @@ class Effects:
         if self.detector:
             d = self.detector
             views = [
-                (w * share, v) for w, one in views for share, v in aperture_views(one, d.aperture, d.aperture_order)
+                (w * share, v)
+                for w, bundle in views
+                for share, v in aperture_views(bundle, d.aperture, d.aperture_order)
             ]
         return views
 
@@ -111,10 +113,10 @@ class Effects:
         def along(view):
             rays = options.subdivided(view)
             integrals = []
-            for things in groups.values():
+            for members in groups.values():
                 total = dr.zeros(mi.Float, rays.height * rays.width)
-                for thing in things:
-                    total += thing.line_integrals(rays, options)
+                for obj in members:
+                    total += obj.line_integrals(rays, options)
                 integrals.append(total)
             return hardened(integrals, bands) if bands else integrals[0]
 
@@ -141,8 +143,8 @@ class Effects:
         if len(views) == 1 and options.pixel == 1 and blurring is None and scattered is None:
             return along(view)
         light = mi.Float(0)
-        for weight, one in views:
-            light += dr.opaque(mi.Float, weight) * options.averaged(dr.exp(-along(one)), view)
+        for weight, bundle in views:
+            light += dr.opaque(mi.Float, weight) * options.averaged(dr.exp(-along(bundle)), view)
             if len(views) > 1:  # one small kernel, launched for each, instead of a large one that takes long to compile
                 dr.eval(light)
         if scattered is not None:
@@ -159,18 +161,18 @@ class Effects:
 
     def expected(self, integrals: Any, view: View) -> Any:
         """-ln of the signal that `measured` gives without noise: saturated, with the gains that the detector leaves in."""
-        found = self.saturated(integrals, view)
+        saturated = self.saturated(integrals, view)
         if not (self.detector and self.detector.gain) or self.detector.corrected:
-            return found
-        return found - mi.Float(np.log(self.detector.maps((view.height, view.width))[0]).ravel())
+            return saturated
+        return saturated - mi.Float(np.log(self.detector.maps((view.height, view.width))[0]).ravel())
 
     def masked(self, scan: Scan) -> Scan:
         """The scan with dead pixels invalid."""
         if not (self.detector and self.detector.dead):
             return scan
         alive = ~self.detector.maps(scan.geometry.nDetector)[1]
-        known = np.ones(scan.projections.shape, bool) if scan.valid is None else scan.valid
-        return replace(scan, valid=known & alive)
+        valid = np.ones(scan.projections.shape, bool) if scan.valid is None else scan.valid
+        return replace(scan, valid=valid & alive)
 
     def binned(self, pixels: int) -> Effects:
         """The effects of a panel of which that many pixels became one, dead ones left out."""

@@ -43,10 +43,10 @@ class TubeParameters:
     bands: int = 5
     materials: dict[str, str] = field(default_factory=dict)
 
-    def given(self) -> dict:
+    def named(self) -> dict:
         """The parameters by their names in a scene."""
-        own = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'materials'}
-        return own | {f'material_{name}': text for name, text in self.materials.items()}
+        values = {f.name: getattr(self, f.name) for f in fields(self) if f.name != 'materials'}
+        return values | {f'material_{name}': text for name, text in self.materials.items()}
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Tube:
         Densities between which a grid of two materials changes from the first to the second, 1/mm.
     bands : int
         Number of terms for the spectrum.
-    given : dict
+    parameters : dict
         The parameters of `of`, by name; those of shapes as material_NAME.
     """
 
@@ -75,7 +75,7 @@ class Tube:
     materials: dict[str, tuple[str, ...]] = field(default_factory=dict)
     split: tuple[float, float] | None = None
     bands: int = 5
-    given: dict = field(default_factory=dict, compare=False)
+    parameters: dict = field(default_factory=dict, compare=False)
 
     @staticmethod
     def of(p: TubeParameters) -> Tube:
@@ -104,7 +104,7 @@ class Tube:
             materials=named,
             split=_split(p.split),
             bands=bands,
-            given=p.given(),
+            parameters=p.named(),
         )
         for names in (tube.material, *named.values()):
             for name in names:
@@ -121,7 +121,7 @@ class Tube:
         """Whether the spectrum changes line integrals: photons of the reference energy alone do not."""
         return not (len(self.spectrum.energies) == 1 and self.spectrum.energies[0] == self.reference)
 
-    def made_of(self, name: str) -> tuple[str, ...]:
+    def materials_of(self, name: str) -> tuple[str, ...]:
         """The materials of a shape.
 
         Raises
@@ -199,9 +199,9 @@ def hardened(integrals: Sequence, bands: energy_bands.Bands) -> Any:
 def by_material(objects: Iterable, tube: Tube) -> dict[str, list]:
     """For each material, the objects of a scene (`projectors.objects`), or parts of objects, made of it."""
     out = {}
-    for thing in objects:
-        names = tube.made_of(thing.name)
-        parts = [thing] if len(names) == 1 else _parts(thing, tube.split)
+    for obj in objects:
+        names = tube.materials_of(obj.name)
+        parts = [obj] if len(names) == 1 else _parts(obj, tube.split)
         for name, part in zip(names, parts):
             out.setdefault(name, []).append(part)
     return out
@@ -214,21 +214,21 @@ def second_share(density: Any, split: tuple[float, float]) -> Any:
     return np.clip(share, 0, 1) if isinstance(share, np.ndarray) else dr.clip(share, 0, 1)
 
 
-def _parts(thing, split):
+def _parts(obj, split):
     """Two copies of an object, with the densities of its two materials."""
-    first, second = copy.copy(thing), copy.copy(thing)
-    if hasattr(thing, 'data'):
-        share = second_share(thing.data * thing.scale, split)
-        first.data, second.data = thing.data * (1 - share), thing.data * share
-    elif hasattr(thing, 'density'):
-        if thing.second is None:
+    first, second = copy.copy(obj), copy.copy(obj)
+    if hasattr(obj, 'data'):
+        share = second_share(obj.data * obj.scale, split)
+        first.data, second.data = obj.data * (1 - share), obj.data * share
+    elif hasattr(obj, 'density'):
+        if obj.second is None:
             raise InputError(
-                f'the ellipsoids {thing.name!r} are of two materials, but have no attribute "second": give '
+                f'the ellipsoids {obj.name!r} are of two materials, but have no attribute "second": give '
                 "it the second one's share in the density of every Gaussian, 0 to 1"
             )
-        first.density, second.density = thing.density * (1 - thing.second), thing.density * thing.second
+        first.density, second.density = obj.density * (1 - obj.second), obj.density * obj.second
     else:
-        raise InputError(f'{thing.name!r}, a mesh or in a shapegroup, cannot be of two materials: give it one')
+        raise InputError(f'{obj.name!r}, a mesh or in a shapegroup, cannot be of two materials: give it one')
     return first, second
 
 

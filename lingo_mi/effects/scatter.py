@@ -102,7 +102,7 @@ class Scatter:
         return replace(self, box=(tuple(low.tolist()), tuple(high.tolist())))
 
     @property
-    def given(self) -> dict:
+    def parameters(self) -> dict:
         """The parameters of `xray_tube` that make it."""
         box = {} if self.box is None else dict(scatter_box=', '.join(repr(x) for corner in self.box for x in corner))
         return (
@@ -144,14 +144,14 @@ class Scatter:
     ) -> tuple[np.ndarray, np.ndarray]:
         """`light` on the coarse grid, from edge to edge of the panel: means and standard errors, float64 [rows, columns]."""
         with dr.suspend_grad():
-            key, made_of = (response, self.voxels, self.energies, self.box), (tube, *objects)
+            key, sources = (response, self.voxels, self.energies, self.box), (tube, *objects)
             if not (
                 _LATEST
                 and key == _LATEST[0]
-                and len(made_of) == len(_LATEST[1])
-                and all(a is b for a, b in zip(made_of, _LATEST[1]))
+                and len(sources) == len(_LATEST[1])
+                and all(a is b for a, b in zip(sources, _LATEST[1]))
             ):
-                _LATEST[:] = key, made_of, _scenes(objects, tube, response, self.voxels, self.energies, self.box)
+                _LATEST[:] = key, sources, _scenes(objects, tube, response, self.voxels, self.energies, self.box)
             low, high, beam, scenes = _LATEST[2]
             beam.aim(view, 2 * float(np.linalg.norm(high - low)))
             rays = _Rays(view, self.grid, -(-self.paths // BATCHES), low, high)
@@ -210,8 +210,8 @@ def _scenes(objects, tube, response, voxels, energies, box):
         shape = tuple(np.maximum(1, np.ceil((high - low) / step - 1e-6)).astype(int).tolist())
     step = (high - low) / shape
     densities = {
-        name: np.maximum(sum(on_grid(thing, low, step, shape) for thing in things), 0)
-        for name, things in by_material(objects, tube).items()
+        name: np.maximum(sum(on_grid(obj, low, step, shape) for obj in members), 0)
+        for name, members in by_material(objects, tube).items()
     }
     beam = mi.load_dict(dict(type='ct_beam'))
     if not any(d.any() for d in densities.values()):

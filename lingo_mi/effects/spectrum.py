@@ -100,9 +100,9 @@ def tube_spectrum(kvp: float, angle: float = 12.0, filtration: str = 'Al 2.5') -
     path = _cache_folder() / f'spekpy-{_version("spekpy")}_{re.sub(r"[^A-Za-z0-9.]", "_", name)}.npz'
     try:
         with np.load(path) as table:
-            found = Spectrum(table['energies'], table['photons'])
-        if abs(found.photons.sum() - 1) < 1e-6:
-            return found
+            cached = Spectrum(table['energies'], table['photons'])
+        if abs(cached.photons.sum() - 1) < 1e-6:
+            return cached
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):  # no cached file yet, or a damaged one
         pass
     tube = library('spekpy').Spek(kvp=kvp, th=angle, dk=STEP)

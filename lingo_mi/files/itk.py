@@ -74,7 +74,7 @@ def read_metaimage(path: Path) -> tuple[np.ndarray, np.ndarray]:
         header.refuse(
             f'has {dimensions:g} dimensions and {channels:g} values a voxel; a 3D volume of single values is needed'
         )
-    kind = header.one_of(_METAIMAGE_TYPES, 'ElementType', fields.get('ElementType', ''))
+    kind = header.choice(_METAIMAGE_TYPES, 'ElementType', fields.get('ElementType', ''))
     if not true('BinaryData') and 'BinaryData' in fields:
         header.refuse('BinaryData must be True: numbers as text are not read')
     dtype = np.dtype(kind).newbyteorder('>' if true('BinaryDataByteOrderMSB', 'ElementByteOrderMSB') else '<')
@@ -91,7 +91,7 @@ def read_metaimage(path: Path) -> tuple[np.ndarray, np.ndarray]:
     matrix = header.numbers(np.eye(3), 'TransformMatrix', 'Rotation', 'Orientation').reshape(3, 3)
     affine[:3, :3] = matrix.T * header.numbers([1, 1, 1], 'ElementSpacing', 'ElementSize')
     affine[:3, 3] = header.numbers([0, 0, 0], 'Offset', 'Position', 'Origin')
-    affine[:3] *= header.one_of(_METAIMAGE_UNITS, 'DistanceUnits', fields.get('DistanceUnits', 'mm'))
+    affine[:3] *= header.choice(_METAIMAGE_UNITS, 'DistanceUnits', fields.get('DistanceUnits', 'mm'))
     return data, affine
 
 
@@ -111,9 +111,9 @@ def read_nrrd(path: Path) -> tuple[np.ndarray, np.ndarray]:
         header.refuse(
             f'has {dimensions:g} dimensions ({" ".join(kinds) or "no kinds"}); a 3D volume of single values is needed'
         )
-    kind = header.one_of(_NRRD_TYPES, 'type', fields.get('type', '').lower())
-    packing = header.one_of(_NRRD_PACKINGS, 'encoding', fields.get('encoding', '').lower())
-    order = header.one_of({'little': '<', 'big': '>'}, 'endian', fields.get('endian', 'little').lower())
+    kind = header.choice(_NRRD_TYPES, 'type', fields.get('type', '').lower())
+    packing = header.choice(_NRRD_PACKINGS, 'encoding', fields.get('encoding', '').lower())
+    order = header.choice({'little': '<', 'big': '>'}, 'endian', fields.get('endian', 'little').lower())
     sizes, (skip,) = header.whole('sizes', [0, 0, 0], 1), header.whole('byte skip', [0], -1)
     if header.numbers([0], 'line skip') != 0 or skip and packing or skip > 2**53:
         header.refuse('line skip, and the byte skip of compressed voxels, must be 0')
@@ -132,7 +132,7 @@ def read_nrrd(path: Path) -> tuple[np.ndarray, np.ndarray]:
     else:
         affine[:3, :3] = np.diag(header.numbers([1, 1, 1], 'spacings'))
     units = {*re.findall(r'"([^"]*)"', fields.get('space units', fields.get('units', '')).lower())}
-    affine[:3] *= header.one_of(_NRRD_UNITS, 'units', ', '.join(sorted(units)))  # one for all axes
+    affine[:3] *= header.choice(_NRRD_UNITS, 'units', ', '.join(sorted(units)))  # one for all axes
     return data, affine
 
 
@@ -166,7 +166,7 @@ class _Header:
             self.refuse(f'{name} must be whole numbers from {least} on, not {shown(self.fields.get(name, ""))}')
         return [int(x) for x in values]
 
-    def one_of(self, choices: dict[str, Any], name: str, text: str) -> Any:
+    def choice(self, choices: dict[str, Any], name: str, text: str) -> Any:
         """The choice that the text of a field names. The message lists one name of each choice."""
         if text not in choices:
             names = {choice: name for name, choice in reversed(choices.items())}

@@ -32,7 +32,14 @@ import numpy as np
 from lingo_mi.common.errors import InputError, shown
 from lingo_mi.common.memory import require_room
 from lingo_mi.files.arrays import numeric
-from lingo_mi.files.scanner_dict import angle_range, from_geometry, make_dataset, make_scan, one_circle, to_geometry
+from lingo_mi.files.scanner_dict import (
+    angle_range,
+    circular_geometry,
+    from_geometry,
+    make_dataset,
+    make_scan,
+    to_geometry,
+)
 from lingo_mi.scan import Dataset
 from lingo_mi.storage.file_access import one_line, reading, replacing
 
@@ -340,7 +347,7 @@ def write_naf(path: PathLike | str, dataset: Dataset) -> None:
     InputError
         If the file cannot be written or the test views have another scanner.
     """
-    geometry = one_circle(dataset, path)
+    geometry = circular_geometry(dataset, path)
     start, total = angle_range(geometry.angles)
     data = {
         **from_geometry(geometry, offset_order='uv'),

@@ -37,9 +37,9 @@ def read_ome_zarr(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
 
     with reading(path, folder=True):
         attributes = _attributes(path)
-    found = attributes.get('ome', attributes)
+    metadata = attributes.get('ome', attributes)
     try:
-        image = found['multiscales'][0]
+        image = metadata['multiscales'][0]
         axes, level = image['axes'], image['datasets'][0]
         names = [str(axis['name']) for axis in axes]
         folder = path / _below(str(level['path']))
@@ -68,12 +68,12 @@ def read_ome_zarr(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
             values = np.asarray(array[...])
         except Exception as error:  # of codecs: many kinds
             fail(f'is damaged: its data cannot be unpacked ({brief(error, 100)}); fetch it again')
-    kept = [i for i, name in enumerate(names) if name in SPACE]
-    values = values.reshape([shape[i] for i in kept])
-    order = [[names[i] for i in kept].index(name) for name in SPACE]
+    spatial = [i for i, name in enumerate(names) if name in SPACE]
+    values = values.reshape([shape[i] for i in spatial])
+    order = [[names[i] for i in spatial].index(name) for name in SPACE]
     affine = np.eye(4)
-    affine[:3, :3] = np.diag((scale[kept] * units)[order])
-    affine[:3, 3] = (shift[kept] * units)[order]
+    affine[:3, :3] = np.diag((scale[spatial] * units)[order])
+    affine[:3, 3] = (shift[spatial] * units)[order]
     ours = attributes.get('lingo_mi')
     return values.transpose(order), affine, f'lingo_mi: {ours}' if isinstance(ours, str) else ''
 
@@ -87,18 +87,18 @@ def _attributes(path):
     """The group's own attributes, of Zarr 3 or 2."""
     for name, key in (('zarr.json', 'attributes'), ('.zattrs', None)):
         if (path / name).is_file():
-            found = _json(path, path / name)
-            found = found.get(key) if key else found
-            if isinstance(found, dict):
-                return found
+            attributes = _json(path, path / name)
+            attributes = attributes.get(key) if key else attributes
+            if isinstance(attributes, dict):
+                return attributes
     raise InputError(f'{path}: is no Zarr group; give the folder that holds zarr.json or .zattrs')
 
 
 def _json(path, file):
-    found = read_json(file)
-    if not isinstance(found, dict):
+    content = read_json(file)
+    if not isinstance(content, dict):
         raise InputError(f'{path}: {file.name} is damaged; fetch it again')
-    return found
+    return content
 
 
 def _below(name):

@@ -18,7 +18,14 @@ import numpy as np
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.memory import require_room
 from lingo_mi.files import arrays
-from lingo_mi.files.scanner_dict import angle_range, from_geometry, make_dataset, make_scan, one_circle, to_geometry
+from lingo_mi.files.scanner_dict import (
+    angle_range,
+    circular_geometry,
+    from_geometry,
+    make_dataset,
+    make_scan,
+    to_geometry,
+)
 from lingo_mi.geometry.limits import MOST_VIEWS
 from lingo_mi.scan import Dataset
 from lingo_mi.storage.file_access import beside, new_folder, one_line, reading
@@ -100,7 +107,7 @@ def write_r2(path: PathLike | str, dataset: Dataset) -> None:
     InputError
         If the folder exists and is not empty, cannot be written, or the test views have another scanner.
     """
-    geometry = one_circle(dataset, path)
+    geometry = circular_geometry(dataset, path)
     start, total = angle_range(geometry.angles)
     scanner = {
         **from_geometry(geometry, offset_order='uv'),

@@ -230,13 +230,15 @@ def to_posed(values: dict, views: Callable[..., Rays], where: PathLike | str) ->
     InputError
         If a value is missing or out of range, or if one is given that the poses already contain.
     """
-    known = [
+    contradictions = [
         k
         for k in ('DSO', 'DSD', 'offDetector', 'angles', 'totalAngle', 'startAngle', *MOTION)
         if values.get(k) is not None
     ]
-    if known:
-        raise InputError(f'{where}: {known[0]} and poses both say where source and panel are; remove one of them')
+    if contradictions:
+        raise InputError(
+            f'{where}: {contradictions[0]} and poses both say where source and panel are; remove one of them'
+        )
     n_detector, n_voxel = _counts(values, 'nDetector', where, 2), _counts(values, 'nVoxel', where, 3)
     step = None
     if values.get('dDetector') is not None or values.get('sDetector') is not None:
@@ -306,7 +308,7 @@ def make_dataset(train: Scan, test: Scan | None, volume: np.ndarray | None, wher
     return Dataset(train, test, volume)
 
 
-def one_circle(dataset: Dataset, where: PathLike | str) -> CircularGeometry:
+def circular_geometry(dataset: Dataset, where: PathLike | str) -> CircularGeometry:
     """The geometry of the training views, for formats of circular scans.
 
     Raises
@@ -322,19 +324,21 @@ def one_circle(dataset: Dataset, where: PathLike | str) -> CircularGeometry:
         raise InputError(
             f"{where}: this format holds circular scans only, and this one has other poses; write it as 'npy' or 'exr'"
         )
-    check_one_scanner(dataset, where)
+    require_same_scanner(dataset, where)
     return geometry
 
 
-def check_one_scanner(dataset: Dataset, where: PathLike | str) -> None:
+def require_same_scanner(dataset: Dataset, where: PathLike | str) -> None:
     """Raises InputError unless the test views differ from the training views in their angles or poses only."""
     geometries = [scan.geometry for scan in (dataset.train, dataset.test) if scan is not None]
     circles = [g for g in geometries if isinstance(g, CircularGeometry)]
     if len(circles) == len(geometries):
-        known = [from_geometry(g) for g in circles]
+        scanners = [from_geometry(g) for g in circles]
     else:
-        known = [(g.mode, g.nDetector, g.grid, g.radius if isinstance(g, CurvedGeometry) else None) for g in geometries]
-    if known[0] != known[-1]:
+        scanners = [
+            (g.mode, g.nDetector, g.grid, g.radius if isinstance(g, CurvedGeometry) else None) for g in geometries
+        ]
+    if scanners[0] != scanners[-1]:
         raise InputError(
             f'{where}: this format holds one scanner, but the training and test views have '
             'different geometries; write them as two files'

@@ -62,11 +62,11 @@ from lingo_mi.files.images import read_exr, write_exr
 from lingo_mi.files.poses import read_poses
 from lingo_mi.files.scanner_dict import (
     MOTION,
-    check_one_scanner,
     from_geometry,
     make_dataset,
     make_scan,
     of_grid,
+    require_same_scanner,
     to_geometry,
     to_posed,
 )
@@ -158,12 +158,12 @@ def posed_geometry(values: dict, n: int, where: PathLike | str, test: bool = Fal
 
     def views(n_detector, step, parallel, origin):
         if isinstance(poses, str):
-            found = read_poses(beside(where, poses), n_detector, step, parallel, origin)
+            rays = read_poses(beside(where, poses), n_detector, step, parallel, origin)
         else:
-            found = astra.from_vectors(poses, n_detector, parallel)
-        if len(found) != n:
-            raise InputError(f'{prefix}poses are {len(found)} views, but there are {n} projections; these must agree')
-        return found
+            rays = astra.from_vectors(poses, n_detector, parallel)
+        if len(rays) != n:
+            raise InputError(f'{prefix}poses are {len(rays)} views, but there are {n} projections; these must agree')
+        return rays
 
     flat = to_posed(values, views, where)
     return _bent(flat, values, where, lambda radius: CurvedGeometry(flat=flat, radius=radius))
@@ -275,10 +275,10 @@ def geometry_file_of(path: Path, geometry: PathLike | str | None = None) -> Any:
     if geometry is not None:
         return geometry
     beside = [path.with_suffix(suffix) for suffix in ('.yml', '.yaml')]
-    found = next((p for p in beside if p.exists()), None)
-    if found is None:
+    file = next((p for p in beside if p.exists()), None)
+    if file is None:
         raise InputError(f'{path}: needs its scan geometry; put it in {beside[0].name} beside it or name the file')
-    return found
+    return file
 
 
 def rows_run_up(values: dict, name: str = 'poses') -> bool:
@@ -378,10 +378,10 @@ def _read_exr_folder(folder):
         raise InputError(f'{where}: valid goes with .npy projections only')
     scans = {}
     for split in ('train', 'test'):
-        given = values.get('test_angles') is not None or values.get('test_poses') is not None
-        if split == 'test' and not (folder / split).is_dir() and not given:
+        has_test_views = values.get('test_angles') is not None or values.get('test_poses') is not None
+        if split == 'test' and not (folder / split).is_dir() and not has_test_views:
             continue
-        if split == 'test' and not given:
+        if split == 'test' and not has_test_views:
             raise InputError(
                 f'{where}: test_angles is missing, but there is a folder of test views; add it, in degrees'
             )
@@ -397,7 +397,7 @@ def _read_exr_folder(folder):
 
 
 def _write_exr_folder(path, dataset):
-    check_one_scanner(dataset, path)
+    require_same_scanner(dataset, path)
     with new_folder(path) as folder:
         for split, scan in (('train', dataset.train), ('test', dataset.test)):
             if scan is not None:

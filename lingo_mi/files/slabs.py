@@ -185,15 +185,15 @@ def _halved(slab: np.ndarray) -> np.ndarray:
 
 def _grouped(slabs: Iterable[tuple[int, np.ndarray]], step: int) -> Iterator[tuple[int, np.ndarray]]:
     """The same slices in slabs that begin at multiples of a pyramid's coarsest step."""
-    begin, kept = 0, None
+    begin, pending = 0, None
     for _, slab in slabs:
-        kept = slab if kept is None else np.concatenate([kept, slab], 2)
-        whole = kept.shape[2] // step * step
+        pending = slab if pending is None else np.concatenate([pending, slab], 2)
+        whole = pending.shape[2] // step * step
         if whole:
-            yield begin, kept[:, :, :whole]
-            begin, kept = begin + whole, kept[:, :, whole:]
-    if kept is not None and kept.shape[2]:
-        yield begin, kept
+            yield begin, pending[:, :, :whole]
+            begin, pending = begin + whole, pending[:, :, whole:]
+    if pending is not None and pending.shape[2]:
+        yield begin, pending
 
 
 def _add(levels: list[Any], begin: int, slab: np.ndarray) -> None:

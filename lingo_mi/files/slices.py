@@ -84,12 +84,12 @@ def tiff_spacing(path: Path) -> tuple[float, float, float | None] | None:
     try:
         with quiet('tifffile'), reading(path), tifffile.TiffFile(path, _multifile=False) as file:
             page: Any = file.pages[0]
-            said = _of_ome(page.description) if '<OME' in page.description[:2000] else _of_imagej(file, page)
+            sizes = _of_ome(page.description) if '<OME' in page.description[:2000] else _of_imagej(file, page)
     except InputError:
         raise
     except Exception:  # a description of another form, of which nothing is known
         return None
-    steps = [size * _MILLIMETRES.get(unit.strip().lower(), math.nan) for size, unit in said]
+    steps = [size * _MILLIMETRES.get(unit.strip().lower(), math.nan) for size, unit in sizes]
     if len(steps) < 2 or not all(math.isfinite(step) and step > 0 for step in steps):
         return None
     return steps[0], steps[1], steps[2] if len(steps) > 2 else None
@@ -109,15 +109,15 @@ def _of_ome(text):
 
 def _of_imagej(file, page):
     """As `_of_ome`. A stack whose slices are 1 unit apart does not say so."""
-    said = file.imagej_metadata or {}
-    if 'unit' not in said or not {'XResolution', 'YResolution'} <= {tag.name for tag in page.tags}:
+    metadata = file.imagej_metadata or {}
+    if 'unit' not in metadata or not {'XResolution', 'YResolution'} <= {tag.name for tag in page.tags}:
         return []
-    unit, out = str(said['unit']), []
+    unit, out = str(metadata['unit']), []
     for name in ('XResolution', 'YResolution'):
         pixels, length = page.tags[name].value
         out.append((length / pixels if pixels else math.nan, unit))
-    depth = said.get('spacing', 1.0 if int(said.get('slices', said.get('images', 1))) > 1 else None)
-    return out if depth is None else [*out, (abs(float(depth)), str(said.get('zunit', unit)))]
+    depth = metadata.get('spacing', 1.0 if int(metadata.get('slices', metadata.get('images', 1))) > 1 else None)
+    return out if depth is None else [*out, (abs(float(depth)), str(metadata.get('zunit', unit)))]
 
 
 def read_tiff_file(path: Path) -> np.ndarray:

@@ -53,8 +53,8 @@ class Unit:
     @classmethod
     def described(cls, text: str) -> Unit | None:
         """The unit that a file's description names; None where it names another."""
-        if found := _HU.fullmatch(text):
-            return cls('hu', float(found[1]))
+        if match := _HU.fullmatch(text):
+            return cls('hu', float(match[1]))
         return {PER_MM.description: PER_MM, 'density per cm': cls('1/cm')}.get(text)
 
 

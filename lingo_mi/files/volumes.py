@@ -142,16 +142,16 @@ def _raw(path, shape, dtype):
     with reading(path):
         size = os.path.getsize(path)
     if shape is None or dtype is None:
-        known = None
+        layout = None
         if size in {math.prod(s) * np.dtype(d).itemsize for s, d in _KNOWN_RAW.values()}:
             with reading(path):
-                known = _KNOWN_RAW.get(git_blob_sha1(Path(path).read_bytes()))
-        if known is None:
+                layout = _KNOWN_RAW.get(git_blob_sha1(Path(path).read_bytes()))
+        if layout is None:
             raise InputError(f'{path}: raw bytes have no header; give the shape (x, y, z) and the dtype')
-        shape, dtype = known
+        shape, dtype = layout
     try:
-        given, shape = dtype, tuple(int(n) for n in shape)
-        dtype = np.dtype(given)
+        dtype_text, shape = dtype, tuple(int(n) for n in shape)
+        dtype = np.dtype(dtype_text)
     except Exception:  # of a text that is no type, NumPy raises many kinds, SyntaxError among them
         raise InputError(
             f'{path}: shape {shown(shape)} or dtype {shown(dtype)} is not understood; give for example (256, 256, 256) '
@@ -159,7 +159,7 @@ def _raw(path, shape, dtype):
         ) from None
     if dtype.kind not in 'buif':
         raise InputError(
-            f'{path}: the dtype of raw bytes must be one of real numbers, such as uint8, not {shown(given)}'
+            f'{path}: the dtype of raw bytes must be one of real numbers, such as uint8, not {shown(dtype_text)}'
         )
     if len(shape) != 3 or min(shape) < 1:
         raise InputError(f'{path}: the shape must be 3 positive numbers (x, y, z), not {shown(shape)}')

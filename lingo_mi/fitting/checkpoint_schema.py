@@ -67,10 +67,10 @@ def require_sound(arrays: dict[str, np.ndarray], plain: Any) -> tuple[Method, Ge
         not len(order) or order.min() >= 0 and order.max() < views and len(np.unique(order)) == len(order),
         'array.order holds views twice, or some that the scan does not have',
     )
-    made = plain['iteration'] * min(method.batch, views)
+    rendered = plain['iteration'] * min(method.batch, views)
     _require(
-        steps is None or steps.max() <= made == steps.sum(),
-        f'array.poses.steps does not add up to the {made} that were made',
+        steps is None or steps.max() <= rendered == steps.sum(),
+        f'array.poses.steps does not add up to the {rendered} that were made',
     )
     return method, geometry
 

@@ -115,9 +115,9 @@ def prune(state: State, control: Densify, forward: ForwardModel, half: np.ndarra
     centre, scale, _, amount = activate(state, forward)
     stays = forward.may_stay(centre, scale, half, largest)
     keep = (amount >= control.prune_density) & stays
-    kept = _take(state, keep)
-    kept.gradient[:], kept.visits[:] = 0, 0
-    return kept
+    pruned = _take(state, keep)
+    pruned.gradient[:], pruned.visits[:] = 0, 0
+    return pruned
 
 
 def reset_opacity(state: State) -> State:

@@ -261,7 +261,7 @@ class Fit(FittedModel):
         return ReportData(
             title=title or self.method.name,
             metrics=numbers if self.method.makes_gaussians else _without_gaussians(numbers),
-            volume=self.own_volume if has_volume else None,
+            volume=self.scan_volume if has_volume else None,
             truth=self.data.volume if has_volume and self.data is not None else None,
             shape=scanner.grid.shape,
             spacing=scanner.grid.spacing,
@@ -294,7 +294,7 @@ class Fit(FittedModel):
     def _repr_html_(self) -> str:
         geometry, parts = self.nominal_geometry, []
         if self.method.makes_volume:
-            parts += [notebook.slices(self.own_volume, geometry.grid.spacing, geometry.grid.centre), '<br>']
+            parts += [notebook.slices(self.scan_volume, geometry.grid.spacing, geometry.grid.centre), '<br>']
         test = None if self.data is None else self.data.test
         if self.views is not None and test is not None:
             labels = [f'held-out view {i}, at {a:.1f}°' for i, a in enumerate(self.view_angles)]

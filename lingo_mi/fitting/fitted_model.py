@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from lingo_mi.common.errors import InputError, require_type
-from lingo_mi.common.runtime import one_at_a_time
+from lingo_mi.common.runtime import drjit_lock
 from lingo_mi.files.images import read_exr
 from lingo_mi.fitting.checkpoint import Checkpoint
 from lingo_mi.fitting.device_state import DeviceState
@@ -106,7 +106,7 @@ class FittedModel:
 
     # ---- images and volumes ----
 
-    @one_at_a_time()
+    @drjit_lock()
     def render(
         self, geometry: Geometry | None = None, progress: Callable[[int, int], None] | None = None
     ) -> np.ndarray:
@@ -116,12 +116,12 @@ class FittedModel:
         """
         return self.model.render(self._device, self._checked(geometry, self.geometry), progress)
 
-    @one_at_a_time()
+    @drjit_lock()
     def line_integrals(self, geometry: Geometry) -> np.ndarray:
         """Line integrals in the views of a geometry, float32 [view, v, u], without the effects that the fit has modelled."""
         return self.model.line_integrals(self._device, geometry)
 
-    @one_at_a_time()
+    @drjit_lock()
     def expected(self, geometry: Geometry) -> np.ndarray:
         """What the scan's detector is expected to measure in views that were taken among those of the scan, float32 [view, v, u].
 
@@ -131,7 +131,7 @@ class FittedModel:
             geometry = self.poses.between(self.nominal_geometry, geometry)
         return self.model.expected(self._device, geometry)
 
-    @one_at_a_time()
+    @drjit_lock()
     def volume(self, grid: Grid | None = None) -> np.ndarray:
         """The density at the voxel centres of a grid (default: the scan's), float32 [x, y, z], per mm.
 
@@ -143,16 +143,16 @@ class FittedModel:
         return self.model.volume(self._device, None if grid is None else self._grid(grid))
 
     @cached_property
-    def own_volume(self) -> np.ndarray:
+    def scan_volume(self) -> np.ndarray:
         """`volume` on the scan's grid, computed once, for all that measures, shows and saves it: not to be written to."""
         return self.volume()
 
-    @one_at_a_time()
+    @drjit_lock()
     def cloud(self) -> Ellipsoids | None:
         """The Gaussians in mm, densities in 1/mm, as an object of a scene; None without densities."""
         return self.model.cloud(self._device)
 
-    @one_at_a_time()
+    @drjit_lock()
     def shares(self) -> np.ndarray | None:
         """The second material's share in every Gaussian's density, float32 [N]; None for one material."""
         share = self.model.shares(self._device)

@@ -13,7 +13,7 @@ import mitsuba as mi
 import numpy as np
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.common.runtime import one_at_a_time
+from lingo_mi.common.runtime import drjit_lock
 from lingo_mi.fitting.average import Average
 from lingo_mi.fitting.checkpoint import Checkpoint
 from lingo_mi.fitting.device_state import DeviceState
@@ -28,7 +28,7 @@ Measure = Callable[[Fit], dict]
 Report = Callable[..., None]
 
 
-@one_at_a_time()
+@drjit_lock()
 def run(
     scan: Scan,
     method: Method,
@@ -116,8 +116,8 @@ def _search(
     judge = HeldOut(scan, method, None if stored is None else stored.search)
     seen = judge.seen
     batch, stopping = min(wanted.batch, len(seen)), replace(wanted.stopping, stop='off')
-    own = replace(wanted, batch=batch, stopping=stopping).bounded(seen)
-    fit = Running(scan, seen, method, seed, stored, judge.record, own)
+    search_method = replace(wanted, batch=batch, stopping=stopping).bounded(seen)
+    fit = Running(scan, seen, method, seed, stored, judge.record, search_method)
 
     def after() -> dict:
         if judge.due(fit.iteration):
@@ -179,13 +179,14 @@ class Running:
         seed: int,
         stored: Checkpoint | None,
         search: dict | None,
-        own: Method | None = None,
+        method_seen: Method | None = None,
     ):
-        """seen: the views of the scan that the steps see; own: the method for these, where it differs; search: a record."""
+        """seen: the views of the scan that the steps see; method_seen: the method for these views, if it differs; search: a
+        record."""
         self.geometry, self.identity, self.seen = scan.geometry, identity(scan), len(seen)
         self.method, self.seed, self.search = method, seed, search
         self.rng, self.average = np.random.default_rng(seed), Average(method.rates.average)
-        self.stepper = (own or method).stepper(seen)
+        self.stepper = (method_seen or method).stepper(seen)
         self.order: list[int] = []
         self.iteration, self.history, self._seconds = 0, [], 0.0
         self._losses = deque(maxlen=-(-len(seen) // self.stepper.method.batch))  # of the last pass over the views

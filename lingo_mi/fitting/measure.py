@@ -19,7 +19,7 @@ def fit_metrics(fit: FittedModel) -> dict:
     """All numbers of a fit: quality of the held-out views and of the volume, None without a truth; IPSD; times; the history."""
     data, views = fit.data, fit.views
     test = None if data is None else data.test
-    volume = fit.own_volume if fit.method.makes_volume else None
+    volume = fit.scan_volume if fit.method.makes_volume else None
     truth = None if data is None else data.volume
     expected = rendered = None
     if test is not None and views is not None:
@@ -57,8 +57,8 @@ def quick_measure(fit: FittedModel) -> dict:
     if data is not None and data.test is not None and fit.views is not None:
         numbers['psnr_2d'] = _number(metrics.psnr_2d(comparable(fit.views, data.test), data.test.projections))
     if data is not None and data.volume is not None and fit.method.makes_volume:
-        numbers['psnr_3d'] = _number(metrics.psnr_3d(fit.own_volume, data.volume))
-        numbers['psnr_3d_r2'] = _number(metrics.psnr_3d_r2(fit.own_volume, data.volume))
+        numbers['psnr_3d'] = _number(metrics.psnr_3d(fit.scan_volume, data.volume))
+        numbers['psnr_3d_r2'] = _number(metrics.psnr_3d_r2(fit.scan_volume, data.volume))
     return numbers
 
 
@@ -140,5 +140,5 @@ def _any(result: dict, *names: str) -> bool:
 
 
 def _shown(result: dict, psnr: str, ssim: str) -> str:
-    known = (('PSNR', psnr, '{:.2f} dB'), ('SSIM', ssim, '{:.4f}'))
-    return ', '.join(f'{name} {form.format(result[key])}' for name, key, form in known if result[key] is not None)
+    formats = (('PSNR', psnr, '{:.2f} dB'), ('SSIM', ssim, '{:.4f}'))
+    return ', '.join(f'{name} {form.format(result[key])}' for name, key, form in formats if result[key] is not None)

@@ -55,8 +55,8 @@ def knows_noise(scan: Scan) -> bool:
 
 def trusted(scan: Scan, effects: str) -> Scan:
     """The scan without the detector's known dead pixels."""
-    known = effects_of(scan) if effects == 'model' else None
-    return scan if known is None else known.masked(scan)
+    fitted_effects = effects_of(scan) if effects == 'model' else None
+    return scan if fitted_effects is None else fitted_effects.masked(scan)
 
 
 def density_unit(scan: Scan, normalise: bool) -> float:

@@ -23,10 +23,10 @@ def residual_numbers(rendered: np.ndarray, test: Scan) -> dict:
     photons = photons_of_images(test.projections, test.valid)
     squares, scaled, pixels = np.zeros((3, len(rendered)))
     for i, (image, measured) in enumerate(zip(rendered, test.projections)):  # one by one, for memory
-        known = np.ones(image.shape, bool) if test.valid is None else test.valid[i]
-        p = image[known].astype(np.float64)
-        square = np.square(p - measured[known])
-        squares[i], scaled[i], pixels[i] = square.sum(), (square / np.exp(np.maximum(p, 0))).sum(), known.sum()
+        valid = np.ones(image.shape, bool) if test.valid is None else test.valid[i]
+        p = image[valid].astype(np.float64)
+        square = np.square(p - measured[valid])
+        squares[i], scaled[i], pixels[i] = square.sum(), (square / np.exp(np.maximum(p, 0))).sum(), valid.sum()
     numbers: dict = dict(
         residual_rms=float(np.sqrt(squares.sum() / pixels.sum())),
         residual_by_view=[float(np.sqrt(s / n)) if n else None for s, n in zip(squares, pixels)],

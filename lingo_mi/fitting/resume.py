@@ -22,7 +22,7 @@ def identity(scan: Scan) -> dict:
     e = effects_of(scan)
     named = None
     if e is not None:
-        named = [e.tube and e.tube.given, e.spot and vars(e.spot), e.scatter and e.scatter.given]
+        named = [e.tube and e.tube.parameters, e.spot and vars(e.spot), e.scatter and e.scatter.parameters]
         named.append(e.detector and vars(e.detector))
     return dict(
         views=len(scan),

@@ -75,7 +75,7 @@ def write_fit(
     names |= {CHECKPOINT}
     remove_others(folder, names)
     if method.makes_volume:
-        write_volume(folder / VOLUME, unit.values(fit.own_volume), geometry.grid, unit.description)
+        write_volume(folder / VOLUME, unit.values(fit.scan_volume), geometry.grid, unit.description)
         if method.makes_gaussians:
             means, scales, quaternions, density = fit.gaussians
             write_ply(folder / CLOUD, means, scales, quaternions, density, fit.shares())

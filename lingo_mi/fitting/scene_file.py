@@ -33,22 +33,26 @@ def write_scene(path: Path, geometry: Geometry, extent: float | None, effects: E
     ]
     lines += _parameters(describe(geometry), 8)
     if effects is not None and effects.detector:
-        given = {k: v for k, v in vars(effects.detector.expected).items() if v != Detector.DEFAULTS[k]}
-        lines += ['        <film type="ct_detector">', *_parameters(given, 12), '        </film>']
+        parameters = {k: v for k, v in vars(effects.detector.expected).items() if v != Detector.DEFAULTS[k]}
+        lines += ['        <film type="ct_detector">', *_parameters(parameters, 12), '        </film>']
     lines += ['    </sensor>']
     if effects is not None and effects.tube:
         spot = {}
         if effects.spot is not None:
             spot = dict(focal_spot='{:g}, {:g}'.format(*effects.spot.size), focal_order=effects.spot.order)
-        given = {
+        parameters = {
             k: v
-            for k, v in effects.tube.given.items()
+            for k, v in effects.tube.parameters.items()
             if not (v is None or k.startswith('material') or v == '' and k != 'filtration')
         }
         if effects.needs_materials:  # the cloud stands for all shapes
-            given['material'] = ' + '.join(effects.tube.fitted())
-        scatter = effects.scatter.within(geometry).given if effects.scatter else {}
-        lines += ['    <emitter type="xray_tube" id="tube">', *_parameters(given | spot | scatter, 8), '    </emitter>']
+            parameters['material'] = ' + '.join(effects.tube.fitted())
+        scatter = effects.scatter.within(geometry).parameters if effects.scatter else {}
+        lines += [
+            '    <emitter type="xray_tube" id="tube">',
+            *_parameters(parameters | spot | scatter, 8),
+            '    </emitter>',
+        ]
     write_text(path, '\n'.join([*lines, '</scene>']) + '\n')
 
 

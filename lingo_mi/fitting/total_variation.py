@@ -84,9 +84,9 @@ def _replayed(*arrays, **settled):
     """
     *gaussians, low, high, step, factor = arrays
     near = _near(gaussians, low, high, settled['extent'])
-    one_each, i = dr.select(near, mi.UInt32(1), 0), dr.arange(mi.UInt32, dr.width(near))
-    place = dr.prefix_reduce(dr.ReduceOp.Add, one_each, exclusive=True)
-    index, taken = dr.zeros(mi.UInt32, dr.width(near)), i < dr.sum(one_each)
+    is_near, i = dr.select(near, mi.UInt32(1), 0), dr.arange(mi.UInt32, dr.width(near))
+    place = dr.prefix_reduce(dr.ReduceOp.Add, is_near, exclusive=True)
+    index, taken = dr.zeros(mi.UInt32, dr.width(near)), i < dr.sum(is_near)
     dr.scatter(index, i, place, near, mode=dr.ReduceMode.Permute)
     far = mi.Point3f(FAR), mi.Vector3f(1), mi.Vector4f(0, 0, 0, 1), mi.Float(0)
     chosen = [dr.select(taken, dr.gather(type(x), x, index, taken), away) for x, away in zip(gaussians, far)]

@@ -59,8 +59,8 @@ class MeasuredView:
         pixels = scan.projections[index].ravel() * np.float32(scan.geometry.grid.scale / unit)
         valid = on_device = None
         if weights is not None:
-            own = weights[index].ravel()
-            pixels, on_device = pixels * own, uploaded(own)
+            pixel_weights = weights[index].ravel()
+            pixels, on_device = pixels * pixel_weights, uploaded(pixel_weights)
         if scan.valid is not None and not scan.valid[index].all():
             valid = mi.Bool(scan.valid[index].ravel())
             dr.make_opaque(valid)

@@ -15,7 +15,7 @@ import numpy as np
 
 from lingo_mi.common.arrays import as_numpy
 from lingo_mi.common.errors import InputError
-from lingo_mi.common.runtime import ensure_variant, one_at_a_time
+from lingo_mi.common.runtime import drjit_lock, ensure_variant
 from lingo_mi.projectors.upload import uploaded_tensor
 
 
@@ -70,18 +70,18 @@ def call(function: Callable[..., Any], arguments: Sequence[Argument], shape: tup
         return mi.TensorXf(function(*tensors), shape)
 
     if kind == 'NumPy':
-        with one_at_a_time():
+        with drjit_lock():
             ensure_variant()
             return of_tensors(*(uploaded_tensor(a.array, a.double) for a in arguments)).numpy()
     if kind == 'Dr.Jit':
-        with one_at_a_time():
+        with drjit_lock():
             ensure_variant('cuda' if dr.backend_v(arrays[0]) == dr.JitBackend.CUDA else 'cpu')
             return of_tensors(*arrays)
     # Imported here, because PyTorch and JAX are heavy and may be missing.
     if kind == 'PyTorch':
         from lingo_mi.functional.through_torch import call_torch
 
-        with one_at_a_time():
+        with drjit_lock():
             return call_torch(of_tensors, arguments, name)
     from lingo_mi.functional.through_jax import call_jax
 
@@ -97,8 +97,8 @@ def _on_host(argument: Argument, name: str) -> Argument:
 def _kind(arguments: Sequence[Argument], name: str) -> str:
     kinds = [framework_of(a.array) for a in arguments]
     if len(set(kinds)) > 1:
-        found = ', '.join(f'{a.name} of {k}' for a, k in zip(arguments, kinds))
-        raise InputError(f'{name}: the arrays must be of one kind, not {found}')
+        given_kinds = ', '.join(f'{a.name} of {k}' for a, k in zip(arguments, kinds))
+        raise InputError(f'{name}: the arrays must be of one kind, not {given_kinds}')
     return kinds[0]
 
 
@@ -113,13 +113,13 @@ def framework_of(array) -> str:
 def _check_shapes(arguments: Sequence[Argument], name: str):
     count = None  # the size that None stands for
     for argument in arguments:
-        found = _shape(argument.array)
-        size = found[0] if found else 0
-        if found != tuple((size if count is None else count) if n is None else n for n in argument.shape):
+        shape = _shape(argument.array)
+        size = shape[0] if shape else 0
+        if shape != tuple((size if count is None else count) if n is None else n for n in argument.shape):
             wanted = ('N' if count is None else count) if None in argument.shape else None
             text = ', '.join(str(wanted if n is None else n) for n in argument.shape)
             raise InputError(
-                f'{name}: {argument.name} must be of the shape [{text}], not [{", ".join(map(str, found))}]'
+                f'{name}: {argument.name} must be of the shape [{text}], not [{", ".join(map(str, shape))}]'
             )
         if None in argument.shape and count is None:
             count = size

@@ -103,9 +103,9 @@ class GaussianProjector(LinearMap):
         return f'GaussianProjector({self.domain_shape[0]} Gaussians to {shape} pixels)'
 
     def on_device(self, x: Any) -> Any:
-        found = dr.concat([self._image(x, view) for view in self._views()])
-        dr.eval(found)
-        return found
+        images = dr.concat([self._image(x, view) for view in self._views()])
+        dr.eval(images)
+        return images
 
     def by_density(self, y: Any) -> Any:
         """`A.T.on_device`: the derivative of the product of images and `y` by the densities."""

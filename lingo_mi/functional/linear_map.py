@@ -14,7 +14,7 @@ from scipy.sparse.linalg import LinearOperator, eigsh
 from lingo_mi.common.arrays import as_numpy
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.memory import room
-from lingo_mi.common.runtime import ensure_variant, one_at_a_time
+from lingo_mi.common.runtime import drjit_lock, ensure_variant
 from lingo_mi.functional.frameworks import framework_of
 from lingo_mi.projectors.upload import uploaded
 
@@ -70,7 +70,7 @@ class LinearMap(ABC):
         if kind == 'NumPy':
             return self.on_host(x)
         if kind == 'Dr.Jit':
-            with one_at_a_time():
+            with drjit_lock():
                 return self._of_drjit(x, batch)
         if kind == 'PyTorch':  # imported here, since it is heavy and may be missing
             from lingo_mi.functional.linear_torch import apply_torch
@@ -86,7 +86,7 @@ class LinearMap(ABC):
             raise InputError(f'{self!r}: the array has NaN or infinity as float32: replace those values first')
         batch = x.shape[: x.ndim - len(self.domain_shape)]
         out = np.empty((*batch, *self.range_shape), np.float32)
-        with one_at_a_time():
+        with drjit_lock():
             ensure_variant()
             for i in np.ndindex(batch):
                 out[i] = self.on_device(uploaded(x[i])).numpy().reshape(self.range_shape)
@@ -102,11 +102,11 @@ class LinearMap(ABC):
             raise InputError(f'{self!r}: the array has NaN or infinity as float32: replace those values first')
         n, parts = math.prod(self.domain_shape), []
         for i in range(math.prod(batch)):
-            one = (
+            item = (
                 flat if not batch else dr.gather(mi.Float, flat, dr.arange(mi.UInt32, n) + dr.opaque(mi.UInt32, i * n))
             )
-            dr.eval(one)
-            parts.append(dr.custom(_Differentiable, self, one))
+            dr.eval(item)
+            parts.append(dr.custom(_Differentiable, self, item))
         out = parts[0] if len(parts) == 1 else dr.concat(parts)
         return mi.TensorXf(out, (*batch, *self.range_shape)) if dr.is_tensor_v(x) else out
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.common.runtime import ensure_variant, one_at_a_time, warn_of_spinning
+from lingo_mi.common.runtime import drjit_lock, ensure_variant, warn_of_spinning
 from lingo_mi.functional.linear_map import LinearMap
 
 ALIGNED = 64  # bytes at which Dr.Jit's own arrays begin; the alignment of others is compiled into kernels
@@ -38,14 +38,14 @@ class _Apply(torch.autograd.Function):
         finite = np.isfinite(x.numpy()).all() if x.device.type == 'cpu' else torch.isfinite(x).all()
         if not finite:
             raise InputError(f'{linear_map!r}: the tensor has NaN or infinity as float32: replace those values first')
-        with one_at_a_time():
+        with drjit_lock():
             active = ensure_variant(None if x.device.type == 'cpu' else 'cuda')
             if x.device.type == 'cpu' and active.startswith('cuda'):
                 return torch.from_numpy(linear_map.on_host(x.numpy(), checked=False))
             batch = x.shape[: x.dim() - len(linear_map.domain_shape)]
             if x.device.type == 'cuda':
                 torch.cuda.current_stream(x.device).synchronize()  # Dr.Jit has a stream of its own
-            out = [_one(linear_map, part) for part in x.reshape(-1, *linear_map.domain_shape)]
+            out = [_apply(linear_map, part) for part in x.reshape(-1, *linear_map.domain_shape)]
         if not batch:
             return out[0]
         stacked = torch.stack(out) if out else x.new_empty(0)
@@ -72,7 +72,7 @@ class _Apply(torch.autograd.Function):
 _Apply.forward.__signature__ = inspect.signature(_Apply.forward)  # pyright: ignore[reportFunctionMemberAccess]
 
 
-def _one(linear_map: LinearMap, x: torch.Tensor) -> torch.Tensor:
+def _apply(linear_map: LinearMap, x: torch.Tensor) -> torch.Tensor:
     """The map of one contiguous tensor, in whose memory Dr.Jit reads."""
     x = x.reshape(-1)
     if x.data_ptr() % ALIGNED:

@@ -123,19 +123,19 @@ def project(
     arrays, geometry, extent = _taken(means, scales, quaternions, density, geometry, extent)
     require_type('geometry', geometry, Geometry, 'of a scan give scan.geometry')
     height, width = geometry.nDetector
-    own = geometry.rays(curved=True)
-    index, options = _indices(views, len(own)), RenderOptions(extent)
-    own = own[index]
+    scan_rays = geometry.rays(curved=True)
+    index, options = _indices(views, len(scan_rays)), RenderOptions(extent)
+    scan_rays = scan_rays[index]
 
     def images(means, scales, quaternions, density, vectors=None):
         cloud = gaussians_of((means, scales, quaternions, density), 'project')
         if vectors is None:
-            seen = (View.of(own, i, height, width) for i in range(len(own)))
+            seen = (View.of(scan_rays, i, height, width) for i in range(len(scan_rays)))
         else:
             on_host(vectors, geometry)
             seen = beams_of(vectors, geometry)
-        found = [line_integrals(*cloud, view=view, options=options) for view in seen]
-        return found[0] if len(found) == 1 else dr.concat(found)
+        parts = [line_integrals(*cloud, view=view, options=options) for view in seen]
+        return parts[0] if len(parts) == 1 else dr.concat(parts)
 
     shape = len(index), height, width
     _require_room(shape, 'project')
@@ -267,9 +267,9 @@ def _indices(views, count: int) -> np.ndarray:
         views = list(views)
         if any(isinstance(i, bool) for i in views):  # a mask is not a list of indices
             raise TypeError
-        found = [operator.index(i) for i in views]
+        indices = [operator.index(i) for i in views]
     except TypeError:
         raise InputError(f'views must be whole numbers, one a view, not {shown(views)}') from None
-    if not found or min(found) < -count or max(found) >= count:
+    if not indices or min(indices) < -count or max(indices) >= count:
         raise InputError(f'views must be at least one number from {-count} to {count - 1}, not {shown(views)}')
-    return np.array(found, int)
+    return np.array(indices, int)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from lingo_mi.common.runtime import one_at_a_time
+from lingo_mi.common.runtime import drjit_lock
 from lingo_mi.functional.frameworks import Argument
 from lingo_mi.projectors.upload import uploaded_tensor
 
@@ -50,7 +50,7 @@ def _on_host(function, result, *arrays):
     """function(*arrays) of NumPy's arrays; a callback where JAX traces, whose errors would hide ours elsewhere."""
 
     def of_numpy(*arrays):
-        with one_at_a_time():
+        with drjit_lock():
             return function(*map(np.asarray, arrays))
 
     if any(isinstance(a, Tracer) for a in arrays):

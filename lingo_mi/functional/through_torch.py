@@ -10,7 +10,7 @@ import mitsuba as mi
 import torch
 
 from lingo_mi.common.errors import InputError
-from lingo_mi.common.runtime import ensure_variant, one_at_a_time, warn_of_spinning
+from lingo_mi.common.runtime import drjit_lock, ensure_variant, warn_of_spinning
 from lingo_mi.functional.frameworks import Argument
 
 
@@ -43,21 +43,21 @@ class _OfDrJit(torch.autograd.Function):
         for tensor, is_wanted in zip(tensors, wanted):
             if is_wanted:
                 dr.enable_grad(tensor)
-        found = function(*tensors)
+        result = function(*tensors)
         if any(wanted):
-            ctx.graph = tensors, found
+            ctx.graph = tensors, result
             ctx.save_for_backward(*arrays)  # asked for, it raises where PyTorch has freed the graph
-        return dr.detach(found).torch().clone()
+        return dr.detach(result).torch().clone()
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, upstream: torch.Tensor) -> tuple:
-        tensors, found = ctx.graph
+        tensors, result = ctx.graph
         assert ctx.saved_tensors
-        with one_at_a_time():
+        with drjit_lock():
             dr.clear_grad(tensors)
-            dr.set_grad(found, _tensor(upstream.contiguous()))
-            dr.enqueue(dr.ADMode.Backward, found)
+            dr.set_grad(result, _tensor(upstream.contiguous()))
+            dr.enqueue(dr.ADMode.Backward, result)
             dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearInterior)
             wanted = zip(tensors, ctx.needs_input_grad[1:])
             return None, *(dr.grad(tensor).torch().clone() if is_wanted else None for tensor, is_wanted in wanted)

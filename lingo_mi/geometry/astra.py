@@ -191,8 +191,8 @@ def pose_rays(proj_geom: dict) -> tuple[Rays, tuple[int, int]]:
     """
     kind = kind_of(proj_geom)
     if kind not in VECTORS:
-        known = ', '.join(CIRCLES | VECTORS | IN_PLANE)
-        raise InputError(f'an ASTRA geometry must be of the type {known}, not {shown(kind)}')
+        types = ', '.join(CIRCLES | VECTORS | IN_PLANE)
+        raise InputError(f'an ASTRA geometry must be of the type {types}, not {shown(kind)}')
     nDetector, vectors, radius = _panel(proj_geom), _given(proj_geom, 'Vectors'), None
     if kind == 'cyl_cone_vec':
         vectors = limits.lengths('Vectors', vectors)

@@ -85,23 +85,23 @@ def vector(name: str, value: ArrayLike, length: int) -> tuple:
 
 def sizes(name: str, value: ArrayLike, length: int) -> tuple:
     """`length` positive lengths, as `vector` takes them."""
-    found = vector(name, value, length)
-    if min(found) <= 0:
-        raise InputError(f'{name} must be positive, not {found}')
-    return found
+    values = vector(name, value, length)
+    if min(values) <= 0:
+        raise InputError(f'{name} must be positive, not {values}')
+    return values
 
 
 def counts(name: str, value: ArrayLike, length: int) -> tuple:
     """`length` whole numbers from 1 to `MOST_COUNT`, as `vector` takes them."""
-    found = vector(name, value, length)
-    if any(x % 1 for x in found):
+    values = vector(name, value, length)
+    if any(x % 1 for x in values):
         raise InputError(f'{name} must be whole numbers, not {shown(value)}')
-    found = tuple(map(int, found))
-    if min(found) <= 0:
-        raise InputError(f'{name} must be positive, not {found}')
-    if max(found) > MOST_COUNT:
-        raise InputError(f'{name} must be at most {MOST_COUNT} along an axis, not {shown(found)}')
-    return found
+    values = tuple(map(int, values))
+    if min(values) <= 0:
+        raise InputError(f'{name} must be positive, not {values}')
+    if max(values) > MOST_COUNT:
+        raise InputError(f'{name} must be at most {MOST_COUNT} along an axis, not {shown(values)}')
+    return values
 
 
 def require_proportions(long: Iterable[float], short: Iterable[float]) -> None:

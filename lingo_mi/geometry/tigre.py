@@ -47,14 +47,14 @@ def scan(geo: Any, angles: ArrayLike) -> Geometry:
         geo = tigre.geometry_default(high_resolution=False)
         scan = Scan(Geometry.from_tigre(geo, angles), tigre.Ax(image, geo, angles)[:, ::-1])
     """
-    given = geo.get if isinstance(geo, Mapping) else lambda name: getattr(geo, name, None)
+    value_of = geo.get if isinstance(geo, Mapping) else lambda name: getattr(geo, name, None)
     angles = np.atleast_1d(limits.angles('angles', angles))
     if angles.ndim == 2 and angles.shape[1] == 3 and not angles[:, 1:].any():
         angles = angles[:, 0]  # what TIGRE makes of plain angles
 
     def each(name, length, default=None):
         """[length], a number where that is 1, or the same for every view where they differ."""
-        value = default if given(name) is None else given(name)
+        value = default if value_of(name) is None else value_of(name)
         if value is None:
             raise InputError(f'the TIGRE geometry has no {name}')
         value = limits.lengths(name, value)
@@ -70,14 +70,14 @@ def scan(geo: Any, angles: ArrayLike) -> Geometry:
 
     def steps(kind, length):
         """The size of a pixel or voxel, which `s` says too."""
-        if given('d' + kind) is not None:
+        if value_of('d' + kind) is not None:
             return each('d' + kind, length)
         count = each('n' + kind, length)
         if not np.all(count >= 1):
-            raise InputError(f'n{kind} of the TIGRE geometry must be positive, not {shown(given("n" + kind))}')
+            raise InputError(f'n{kind} of the TIGRE geometry must be positive, not {shown(value_of("n" + kind))}')
         return each('s' + kind, length) / count
 
-    mode = given('mode')
+    mode = value_of('mode')
     if mode is None or isinstance(mode, str) and not mode:
         mode = 'cone'
     if not isinstance(mode, str):

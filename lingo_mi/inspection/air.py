@@ -57,11 +57,11 @@ def air_of(scan: Scan) -> Air | None:
     """
     p = scan.projections
     n, nv, nu = p.shape
-    known = np.ones(p.shape, bool) if scan.valid is None else scan.valid
-    high, width = float(np.percentile(p[known], 99.5)), max(2, nu // STRIP)
+    valid = np.ones(p.shape, bool) if scan.valid is None else scan.valid
+    high, width = float(np.percentile(p[valid], 99.5)), max(2, nu // STRIP)
     if high <= 0 or nu < 4 * width:
         return None
-    strips = [(np.where(known[:, :, part], p[:, :, part], np.nan), x) for part, x in _edges(nu, width)]
+    strips = [(np.where(valid[:, :, part], p[:, :, part], np.nan), x) for part, x in _edges(nu, width)]
     strips = [(strip, x) for strip, x in strips if np.isfinite(strip).any((1, 2)).all()]
     if not strips:
         return None
@@ -82,9 +82,9 @@ def air_of(scan: Scan) -> Air | None:
     if not values:
         return None
     measured, places = np.array(values).T, np.array(columns)
-    told = [True, nv >= ROWS and len(values) >= ROWS, len(set(places[:, 2])) > 1]
+    determined = [True, nv >= ROWS and len(values) >= ROWS, len(set(places[:, 2])) > 1]
     levels = np.zeros((n, 3))
-    levels[:, told] = np.linalg.lstsq(places[:, told], measured.T, rcond=None)[0].T
+    levels[:, determined] = np.linalg.lstsq(places[:, determined], measured.T, rcond=None)[0].T
     if np.sqrt(np.square(measured - levels @ places.T).mean()) > FLAT * high:
         return None
     return Air(levels, float(levels[:, 0].std()), _matters(levels, high))

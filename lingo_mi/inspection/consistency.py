@@ -97,9 +97,9 @@ def best_shift(plane: Plane, angles: np.ndarray, reach: float) -> tuple[float, f
 
 def swapped(plane: Plane, angles: np.ndarray, shift: float) -> tuple[int, int] | None:
     """Two views that agree with the others twice as well in each other's place; None if there are no such."""
-    given, each = disagreement(plane, angles, shift)
+    difference, each = disagreement(plane, angles, shift)
     worst = np.argsort(each)[::-1][:6]
-    best, pair = given / 2, None
+    best, pair = difference / 2, None
     for i in worst:
         for j in {*worst.tolist(), (i - 1) % len(angles), (i + 1) % len(angles)} - {int(i)}:
             order = np.arange(len(angles))

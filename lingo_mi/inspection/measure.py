@@ -228,13 +228,13 @@ def measure(scan: Scan) -> Findings:
     valid = np.ones(p.shape, bool) if scan.valid is None else scan.valid
     high, highest = float(np.percentile(p[valid], 99.5)), float(p[valid].max())
     border = _border(p, valid, high)
-    given, (scan, level) = scan, steady(scan)
+    original, (scan, level) = scan, steady(scan)
     p, air = scan.projections, 0.0 if level else (border and border.air) or 0.0
-    intensities = open_beam(given)
+    intensities = open_beam(original)
     photons = np.inf if intensities is not None else photons_of_images(p, scan.valid)
-    clipped = float((given.projections[valid] == highest).mean())
+    clipped = float((original.projections[valid] == highest).mean())
     many = clipped > 1e-3 and clipped * valid.sum() > 2 * len(scan) and highest > 0
-    mass = np.array([(view[known].mean() - air) if known.any() else 0.0 for view, known in zip(p, valid)])
+    mass = np.array([(view[mask].mean() - air) if mask.any() else 0.0 for view, mask in zip(p, valid)])
     black, doubled = _black_and_doubled(p - air, valid, mass)
     suspects = [*black, *doubled]
     truncated = border is not None and (border.cut_sides or border.cut_ends)
@@ -242,7 +242,7 @@ def measure(scan: Scan) -> Findings:
         invalid=invalid,
         high=high,
         highest=highest,
-        negative=bool(-np.percentile(given.projections[valid], 0.5) > 2 * max(high, 0)),
+        negative=bool(-np.percentile(original.projections[valid], 0.5) > 2 * max(high, 0)),
         intensities=intensities,
         border=border,
         air=level,
@@ -273,7 +273,7 @@ def _without(scan, columns):
     return replace(scan, valid=valid)
 
 
-def said_of_intensities(I0: float) -> str:
+def intensity_warning(I0: float) -> str:
     """What to do with projections that are intensities, `I0` beside the object."""
     return (
         'these look like intensities, not line integrals: values are highest, and alike, at the edges of the panel; write '
@@ -285,7 +285,7 @@ def said_of_intensities(I0: float) -> str:
 def warn_of_intensities(scan: Scan) -> None:
     """Warn if the projections of a scan look like intensities."""
     if (I0 := open_beam(scan)) is not None:
-        warnings.warn(said_of_intensities(I0), stacklevel=3)
+        warnings.warn(intensity_warning(I0), stacklevel=3)
 
 
 def open_beam(scan: Scan) -> float | None:
@@ -349,7 +349,7 @@ def _air_spread(p, limit):
     """Standard deviation of the views' air levels, those of pixels near the sides that are below the limit, without its noise."""
     edge = max(1, p.shape[2] // 64)
     near = np.concatenate([p[:, :, :edge], p[:, :, -edge:]], 2).reshape(len(p), -1)
-    air = [known for view in near if (known := view[view < limit]).size > 8]
+    air = [air_values for view in near if (air_values := view[view < limit]).size > 8]
     if len(air) < len(p) / 2:
         return None
     noise = np.mean([np.pi / 2 * view.var() / view.size for view in air])  # of a median
@@ -394,7 +394,7 @@ def _plane(scan: Scan, air: float) -> Plane | Obstacle:
     p = scan.projections.astype(float) - air
     valid = np.ones(p.shape, bool) if scan.valid is None else scan.valid
     if geometry.mode == 'parallel':
-        known: np.ndarray = np.any(valid, axis=1)
+        valid_pixels: np.ndarray = np.any(valid, axis=1)
         row = (p * valid).sum(1) / np.maximum(valid.sum(1), 1)
     else:
         middle = nv / 2 - 0.5 + geometry.offDetector[0] / dv
@@ -403,10 +403,10 @@ def _plane(scan: Scan, air: float) -> Plane | Obstacle:
         first = min(max(int(np.floor(middle)), 0), nv - 1)
         last = min(first + 1, nv - 1)
         part = min(max(middle - first, 0.0), 1.0)
-        row, known = (1 - part) * p[:, first] + part * p[:, last], valid[:, first] & valid[:, last]
-    if (~known[:, :-1] & ~known[:, 1:]).any():  # a gap that a mean of neighbours does not fill
+        row, valid_pixels = (1 - part) * p[:, first] + part * p[:, last], valid[:, first] & valid[:, last]
+    if (~valid_pixels[:, :-1] & ~valid_pixels[:, 1:]).any():  # a gap that a mean of neighbours does not fill
         return 'gaps'
-    row = np.stack([_bridged(*line) for line in zip(row, known)])
+    row = np.stack([_bridged(*line) for line in zip(row, valid_pixels)])
     by = max(1, nu // COLUMNS)
     columns = nu // by
     row = row[:, : columns * by].reshape(len(p), columns, by).mean(2)
@@ -417,10 +417,10 @@ def _plane(scan: Scan, air: float) -> Plane | Obstacle:
     return Plane(row, geometry.angles, u, geometry.DSD if geometry.mode == 'cone' else 0.0)
 
 
-def _bridged(values, known):
+def _bridged(values, valid):
     """A row with what is not known interpolated between its neighbours."""
     place = np.arange(len(values))
-    return values if known.all() or not known.any() else np.interp(place, place[known], values[known])
+    return values if valid.all() or not valid.any() else np.interp(place, place[valid], values[valid])
 
 
 def _orbit(scan, air, suspects):
@@ -445,18 +445,18 @@ def _orbit(scan, air, suspects):
     plane = plane.subset(index)
     reach = 0.08 * np.ptp(plane.u)
     shift, best = best_shift(plane, plane.angles, reach)
-    given = disagreement(plane, plane.angles)[0]
-    if not np.isfinite(given) or not np.isfinite(best):
+    unshifted = disagreement(plane, plane.angles)[0]
+    if not np.isfinite(unshifted) or not np.isfinite(best):
         return Orbit(turn, obstacle='aside')
-    found = Orbit(turn, disagreement=given, shift=shift, shifted=best)
+    orbit = Orbit(turn, disagreement=unshifted, shift=shift, shifted=best)
     _, other = best_shift(plane, -plane.angles, reach) if plane.DSD else (0.0, np.inf)
     if best > CLEAR and other < 0.4 * best:
-        return replace(found, reversed=other)
+        return replace(orbit, reversed=other)
     pair = swapped(plane, plane.angles, shift) if best > 0.2 * CLEAR else None
     if pair is not None:
-        return replace(found, swapped=(int(index[pair[0]]), int(index[pair[1]])))
+        return replace(orbit, swapped=(int(index[pair[0]]), int(index[pair[1]])))
     pixel = geometry.dDetector[1]
-    return replace(found, off_axis=not found.short and abs(shift) > 0.5 * pixel and best < 0.7 * given)
+    return replace(orbit, off_axis=not orbit.short and abs(shift) > 0.5 * pixel and best < 0.7 * unshifted)
 
 
 def _turn(geometry):

@@ -13,7 +13,7 @@ from lingo_mi.scan import Scan
 from lingo_mi.storage.file_access import replacing
 
 
-def draw(path: PathLike | str, scan: Scan, found: Findings) -> None:
+def draw(path: PathLike | str, scan: Scan, findings: Findings) -> None:
     """Writes a PNG.
 
     Raises
@@ -34,10 +34,10 @@ def draw(path: PathLike | str, scan: Scan, found: Findings) -> None:
         axes.set_title(f'view {i}', fontsize=10)
         axes.set(xticks=[], yticks=[])
     axes = figure.add_subplot(2, 4, 8)
-    axes.plot(found.mass, '.-', color='#1f77b4', markersize=4, linewidth=0.8)
-    axes.plot(found.suspects, found.mass[found.suspects], 'o', color='#d1495b', fillstyle='none')
+    axes.plot(findings.mass, '.-', color='#1f77b4', markersize=4, linewidth=0.8)
+    axes.plot(findings.suspects, findings.mass[findings.suspects], 'o', color='#d1495b', fillstyle='none')
     axes.set_title('mean line integral of a view', fontsize=10)
-    axes.set(xlabel='view', ylim=(1.2 * min(found.mass.min(), 0), 1.2 * max(found.mass.max(), 1e-9)))
+    axes.set(xlabel='view', ylim=(1.2 * min(findings.mass.min(), 0), 1.2 * max(findings.mass.max(), 1e-9)))
     with replacing(path) as temporary:
         figure.savefig(temporary, dpi=100, format='png')
 

@@ -26,8 +26,8 @@ def text_order(scan: Scan) -> np.ndarray | None:
         return None
     blocks = _blocks(scan.projections)
     by_angle = np.argsort(scan.geometry.angles, kind='stable')
-    best, given = None, _roughness(blocks[by_angle])
-    least = SMOOTHER * given
+    best, roughness = None, _roughness(blocks[by_angle])
+    least = SMOOTHER * roughness
     for first in (0, 1):
         place = np.array(sorted(range(first, first + n), key=str)) - first
         ordered = np.empty_like(blocks)

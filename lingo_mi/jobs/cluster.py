@@ -157,8 +157,8 @@ class Cluster:
             raise InputError(
                 f'no worker of the cluster came within {PATIENCE:.0f} s; start some, by `dask worker --nthreads 1`'
             ) from None
-        for found in self.client.run(describe_worker, self.folder).values():
-            require_fit(found, self.folder)
+        for worker in self.client.run(describe_worker, self.folder).values():
+            require_fit(worker, self.folder)
 
 
 def _gone() -> tuple[type[BaseException], ...]:

@@ -23,16 +23,16 @@ def describe_worker(folder: str, dask_worker: Any) -> dict:
     )
 
 
-def require_fit(found: dict, folder: str) -> None:
+def require_fit(worker: dict, folder: str) -> None:
     """Raises InputError where a worker, by what `describe_worker` says, cannot do the jobs."""
-    who = f'worker {found["address"]}'
-    if found['version'] != (ours := version('lingo_mi')):
-        raise InputError(f'{who}: has lingo_mi {found["version"]}, not {ours}; install the same there')
-    if found['tasks'] != 1:
+    who = f'worker {worker["address"]}'
+    if worker['version'] != (ours := version('lingo_mi')):
+        raise InputError(f'{who}: has lingo_mi {worker["version"]}, not {ours}; install the same there')
+    if worker['tasks'] != 1:
         raise InputError(
-            f'{who}: runs {found["tasks"]} tasks at once, which would share one Dr.Jit; start it by `dask worker --nthreads 1`'
+            f'{who}: runs {worker["tasks"]} tasks at once, which would share one Dr.Jit; start it by `dask worker --nthreads 1`'
         )
-    if not found['sees']:
+    if not worker['sees']:
         raise InputError(
             f'{who}: does not see the folder {folder}; choose one on a file system that all machines share'
         )
@@ -56,12 +56,12 @@ def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str
 
     worker = get_worker()
     worker.log_event(topic, Event(job.name, 'began', worker.address))
-    told = time.monotonic()
+    reported = time.monotonic()
 
     def report(done, **_):
-        nonlocal told
-        if time.monotonic() - told > PAUSE:
-            told = time.monotonic()
+        nonlocal reported
+        if time.monotonic() - reported > PAUSE:
+            reported = time.monotonic()
             worker.log_event(topic, Event(job.name, 'step', done))
             task = worker.state.tasks.get(key)
             if task is None or task.state == 'cancelled':  # nobody waits for it any more

@@ -36,8 +36,8 @@ def masks(projections: np.ndarray, low_factor: float = 0.1, valid: np.ndarray | 
         Bool [n, v, u]; invalid pixels affect no threshold and are in no mask. None: all are valid.
     """
     projections = np.asarray(projections)
-    known = [...] * len(projections) if valid is None else valid
-    t_high = np.array([otsu(image[v]) if v is ... or v.any() else 0.0 for image, v in zip(projections, known)])
+    valid_views = [...] * len(projections) if valid is None else valid
+    t_high = np.array([otsu(image[v]) if v is ... or v.any() else 0.0 for image, v in zip(projections, valid_views)])
     t_low = t_high * low_factor
     at = (slice(None), None, None)
     low, high = projections > t_low[at], projections > t_high[at]
@@ -46,14 +46,14 @@ def masks(projections: np.ndarray, low_factor: float = 0.1, valid: np.ndarray | 
     return Masks(low, high, t_low, t_high, valid)
 
 
-def truncated(found: Masks, share: float = 0.05) -> np.ndarray:
+def truncated(masks: Masks, share: float = 0.05) -> np.ndarray:
     """Views, bool [n], in which the object reaches the edge of the panel: the low mask contains more than `share` of the
     outermost pixels of a side.
 
     An axis of one pixel (a fan beam's rows) is not checked.
     """
-    low = found.low
-    sides = [side for axis in (2, 1) if low.shape[axis] > 1 for side in _sides(low, found.valid, axis, share)]
+    low = masks.low
+    sides = [side for axis in (2, 1) if low.shape[axis] > 1 for side in _sides(low, masks.valid, axis, share)]
     return np.any(sides, 0) if sides else np.zeros(len(low), bool)
 
 
@@ -63,5 +63,5 @@ def _sides(low, valid, axis, share):
         return [low.take(end, axis).mean(1) > share for end in (0, -1)]
     lines, last = valid.any(axis), low.shape[axis] - 1
     ends = valid.argmax(axis), last - np.flip(valid, axis).argmax(axis)
-    found = (np.take_along_axis(low, np.expand_dims(end, axis), axis).squeeze(axis) for end in ends)
-    return [(side & lines).sum(1) > share * np.maximum(lines.sum(1), 1) for side in found]
+    sides = (np.take_along_axis(low, np.expand_dims(end, axis), axis).squeeze(axis) for end in ends)
+    return [(side & lines).sum(1) > share * np.maximum(lines.sum(1), 1) for side in sides]

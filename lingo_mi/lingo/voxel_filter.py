@@ -160,13 +160,13 @@ def valid_voxels(
         for view, (matrix, low_image, high_image) in enumerate(zip(matrices, low_images, high_images)):
             index, inside = pixels(matrix, points, shape)
             counts = inside if outside == 'ignore' else True
-            known = inside
+            measured = inside
             if valid is not None:
-                known = inside & valid[view][index]
-                counts = counts & (known | ~inside)
+                measured = inside & valid[view][index]
+                counts = counts & (measured | ~inside)
             missed_low += counts & ~(low_image[index] & inside)
             missed_high += counts & ~(high_image[index] & inside)
-            seen += known
+            seen += measured
             keep = (missed_low <= misses) | (missed_high <= misses)
             if np.count_nonzero(keep) < 0.9 * len(keep):  # cells that left both sets stay out
                 alive, points, missed_low, missed_high, seen = (

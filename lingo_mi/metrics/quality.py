@@ -150,8 +150,8 @@ def ssim_3d(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> f
     def of(slab):
         low = max(slab.start - reach, 0)
         near = slice(low, slab.stop + reach)  # the window of the slab's voxels reaches that far
-        found = ssim_map(volume[near].astype(float) / peak, truth[near].astype(float) / peak, axes)
-        return found[slab.start - low : slab.stop - low].sum()
+        similarity = ssim_map(volume[near].astype(float) / peak, truth[near].astype(float) / peak, axes)
+        return similarity[slab.start - low : slab.stop - low].sum()
 
     size = (_thickness(truth) + 2 * reach) * truth[0].size
     return float(sum(_each(of, ((slab,) for slab in _slabs(truth)), size)) / truth.size)

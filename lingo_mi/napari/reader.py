@@ -28,7 +28,7 @@ def reader_of(path: str | list[str]) -> Callable[[str | list[str]], list[LayerDa
     path : str or list of str
         A file or folder, or several of them.
     """
-    return read if all(_kind(Path(one)) for one in _paths(path)) else None
+    return read if all(_kind(Path(each)) for each in _paths(path)) else None
 
 
 def read(path: str | list[str]) -> list[LayerData]:
@@ -46,7 +46,7 @@ def read(path: str | list[str]) -> list[LayerData]:
     --------
     >>> layers = read('out/foot')
     """
-    return [layer for one in _paths(path) for layer in _layers(Path(one))]
+    return [layer for each in _paths(path) for layer in _layers(Path(each))]
 
 
 def volume_layer(volume: np.ndarray, spacing: Any, first: Any, name: str) -> LayerData:
@@ -80,8 +80,8 @@ def _layers(path: Path) -> list[LayerData]:
     if kind == 'result':
         return [layer for name in (VOLUME, CLOUD) if (path / name).exists() for layer in _layers(path / name)]
     if kind == 'volume':
-        found = read_volume(path)
-        return [volume_layer(found.data, found.spacing, found.affine[:3, 3], path.name)]
+        volume = read_volume(path)
+        return [volume_layer(volume.data, volume.spacing, volume.affine[:3, 3], path.name)]
     if kind == 'cloud':
         return [_cloud(path)]
     if kind == 'scan':

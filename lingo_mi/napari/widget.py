@@ -30,7 +30,7 @@ class FitWidget(widgets.Container):
         self._viewer, self._stop, self._layer = napari_viewer, threading.Event(), None
         self.scan = widgets.FileEdit(label='Scan', mode='r')
         self.method = widgets.ComboBox(
-            label='Method', choices=[name for name, one in METHODS.items() if one.makes_volume]
+            label='Method', choices=[name for name, method in METHODS.items() if method.makes_volume]
         )
         self.steps = widgets.SpinBox(label='Steps', min=1, max=1_000_000, value=METHODS['fast'].iterations)
         self.start, self.cancel = widgets.PushButton(text='Fit'), widgets.PushButton(text='Cancel', enabled=False)
@@ -56,7 +56,7 @@ class FitWidget(widgets.Container):
             method, scan = method_of(name, iterations=steps), read_scan(path).train
 
             def show(fit: Fit) -> dict:
-                self._show(fit.own_volume, scan.geometry.grid, fit.steps, steps)
+                self._show(fit.scan_volume, scan.geometry.grid, fit.steps, steps)
                 return {}
 
             def between(iteration: int, **_: Any) -> None:

@@ -42,12 +42,12 @@ class Analytic(Protocol):
 class Scaled:
     """An analytic object with all densities times a factor."""
 
-    thing: Analytic
+    analytic: Analytic
     factor: float
 
     def project(self, geometry: Geometry) -> np.ndarray:
         """As `Analytic.project`."""
-        return self.thing.project(geometry) * np.float32(self.factor)
+        return self.analytic.project(geometry) * np.float32(self.factor)
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,5 +127,5 @@ def make(name: str, size: int, seed: int = 0, attenuation: str = 'x3d') -> Phant
         raise InputError(f'the seed must not be negative, not {seed}')
     module = importlib.import_module(f'.{name}', __name__)
     data, side, analytic = module.build(size, seed)
-    made = Phantom(data, (side / size,) * 3, name, analytic)
-    return made if attenuation == 'x3d' else made.scaled(DENSEST)
+    phantom = Phantom(data, (side / size,) * 3, name, analytic)
+    return phantom if attenuation == 'x3d' else phantom.scaled(DENSEST)

@@ -347,10 +347,10 @@ def _thin(grid, image, cone, value):
     """A tube that may be thinner than a voxel: it keeps its cross-section, not its full contrast."""
     r = (cone.ra + cone.rb) / 2
     wide = max(r, grid.h / 2)
-    found = grid.near(Cone(cone.a, cone.b, wide, wide), grid.h)
-    if found is None:
+    near = grid.near(Cone(cone.a, cone.b, wide, wide), grid.h)
+    if near is None:
         return
-    where, p = found
+    where, p = near
     seen = Cone(cone.a, cone.b, *np.maximum((cone.ra, cone.rb), grid.h / 2))
     c = grid.cover(seen(*p)) * np.float32((r / wide) ** 2)
     image[where] += c * (np.float32(value) - image[where])
@@ -367,10 +367,10 @@ def _skeleton(grid, image, texture):
     for solid, cortex, spongy in (
         [(v, 1.1, 0.445) for v in vertebrae] + [(r, 1.3, 0.44) for r in ribs] + [(g, 1.7, 0.44) for g in _girdle()]
     ):
-        found = grid.near(solid, grid.h)
-        if found is None:
+        near = grid.near(solid, grid.h)
+        if near is None:
             continue
-        where, p = found
+        where, p = near
         d = solid(*p)
         core = spongy + np.float32(0.022) * texture(grid, where)
         inner = np.clip(np.float32(0.5) - (d + np.float32(cortex)) / max(np.float32(1.2), grid.h), 0, 1)

@@ -285,9 +285,9 @@ def _skin(grid: Cube) -> np.ndarray:
         r = (11.8, 12, 9.8) if i == 0 else (8.6, 7.6, 7.8, 6.6) if i < 3 else (8.4, 7.2, 7.2, 6.2)
         pulp = Ellipsoid(np.array(toe[-1]) + [0, -3, 2], (11, 12, 9) if i == 0 else (7.3, 7.5, 6.8))
         toe = Blend((tube(toe, r), pulp), 3.0)
-        found = grid.near(toe, 12)
-        if found is not None:
-            where, p = found
+        near = grid.near(toe, 12)
+        if near is not None:
+            where, p = near
             toes[where] = np.minimum(toes[where], toe(*p))
     d = smooth_min(d, toes, 5.0)
     # The sole: flat under heel, ball and lateral edge, raised under the medial arch.
@@ -408,9 +408,9 @@ def build(size: int, seed: int) -> tuple[np.ndarray, float, None]:
     for t in _tendons():
         grid.paint(image, t, TENDON)
     for v in _vessels(rng):
-        found = grid.near(v, grid.h)
-        if found is not None:
-            where, p = found
+        near = grid.near(v, grid.h)
+        if near is not None:
+            where, p = near
             # A vessel thinner than a voxel keeps its mass, not its full contrast.
             c = grid.cover(v(*p)) * min(1.0, 2 * min(v.ra, v.rb) / grid.h)
             image[where] += c * np.maximum(np.float32(FAT + 0.03) - image[where], 0)
@@ -432,10 +432,10 @@ def build(size: int, seed: int) -> tuple[np.ndarray, float, None]:
 
 def _add_bone(grid, b: Bone, trabecular, relief, nearest, bone, part):
     """Carve a bone by the earlier ones; add its density to `bone`, its cover to `part`; update `nearest`."""
-    found = grid.near(b.solid, 6.0)
-    if found is None:
+    near = grid.near(b.solid, 6.0)
+    if near is None:
         return
-    where, (x, y, z) = found
+    where, (x, y, z) = near
     bumps, texture = relief(grid, where), trabecular(grid, where)
     middle = np.float32(0)
     if b.shaft is not None:

@@ -250,10 +250,10 @@ class Cube:
         soft : float
             Width over which the solid's edge fades, at least a voxel.
         """
-        found = self.near(solid, max(self.h, soft))
-        if found is None:
+        near = self.near(solid, max(self.h, soft))
+        if near is None:
             return
-        where, p = found
+        where, p = near
         c = np.clip(np.float32(0.5) - solid(*p) / np.float32(max(self.h, soft)), 0, 1)
         image[where] += c * ((value(where) if callable(value) else np.float32(value)) - image[where])
 
@@ -263,9 +263,9 @@ def union(grid: Cube, solids: Iterable, k: float, pad: float) -> np.ndarray:
     elsewhere."""
     d = np.full(grid.shape, pad, np.float32)
     for s in solids:
-        found = grid.near(s, pad)
-        if found is not None:
-            where, p = found
+        near = grid.near(s, pad)
+        if near is not None:
+            where, p = near
             d[where] = smooth_min(d[where], np.minimum(s(*p), np.float32(pad)), k)
     return d
 

@@ -42,8 +42,8 @@ def project_phantom(
     projections of its voxels on the geometry's grid, trilinear, which need an active Mitsuba variant.
     progress: called as progress(views done, views) after every view.
     """
-    own = np.allclose(geometry.grid.spacing, phantom.spacing, rtol=1e-6) and not any(geometry.grid.centre)
-    if phantom.analytic is None or not own:
+    same_grid = np.allclose(geometry.grid.spacing, phantom.spacing, rtol=1e-6) and not any(geometry.grid.centre)
+    if phantom.analytic is None or not same_grid:
         from lingo_mi.projectors import grid
 
         return grid.project_volume(phantom.data, geometry, progress)

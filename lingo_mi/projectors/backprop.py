@@ -57,6 +57,6 @@ class Cuts:
         pass_on(values, gradients, keep if self.parts else flags)
         while self.parts:
             values, copies = self.parts.pop()
-            found = [dr.grad(copy) for copy in copies]
-            dr.eval(found)
-            pass_on(values, found, keep if self.parts else flags)
+            derivatives = [dr.grad(copy) for copy in copies]
+            dr.eval(derivatives)
+            pass_on(values, derivatives, keep if self.parts else flags)

@@ -310,8 +310,8 @@ class Sums:
         if not self.packed:
             return self.arrays
         i = dr.arange(mi.UInt32, dr.width(self.arrays[0]) // PACKET)
-        found = [x for array in self.arrays for x in dr.gather(mi.Vector4f, array, i)]
-        return found[: self.count]
+        columns = [x for array in self.arrays for x in dr.gather(mi.Vector4f, array, i)]
+        return columns[: self.count]
 
 
 class Work:

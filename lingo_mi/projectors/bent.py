@@ -53,8 +53,8 @@ def on_plane(tables: tuple[Any, Any], panel: tuple[int, int], view: Any, u: Any,
 
 def column(table: Any, panel: tuple[int, int], view: Any, u: Any) -> tuple[Any, Any]:
     """X and s of columns u of views, from the first of `tables`."""
-    found = dr.gather(mi.Vector2f, table, view * panel[1] + u)
-    return found.x, found.y
+    entry = dr.gather(mi.Vector2f, table, view * panel[1] + u)
+    return entry.x, entry.y
 
 
 def numbers_of(table: Any, view: Any) -> list[Any]:

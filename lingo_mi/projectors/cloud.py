@@ -108,11 +108,11 @@ class _LineIntegrals(dr.CustomOp):
     """
 
     def eval(self, inputs, wanted, settings, primal, bend):
-        self.inputs, self.wanted, self.settings, self.parts, self.known = inputs, wanted, settings, 1, None
+        self.inputs, self.wanted, self.settings, self.parts, self.prepared = inputs, wanted, settings, 1, None
         self.bend = bend
         if not primal:
             return dr.zeros(mi.Float, settings['panel'].pixels)
-        prepared, straddling = self._look()
+        prepared, straddling = self._prepared_arrays()
         options = settings['options']
         if (options.footprint == 'affine' or options.area) and dr.width(straddling):
             warnings.warn(
@@ -124,7 +124,7 @@ class _LineIntegrals(dr.CustomOp):
             )
         image = _DRAW(*bend, *prepared, *inputs[-POSE:], parts=self.parts, **settings)
         if any(wanted):
-            self.known = prepared, straddling
+            self.prepared = prepared, straddling
         return _with_rest(image, inputs, bend, settings, straddling)
 
     def forward(self):
@@ -139,14 +139,14 @@ class _LineIntegrals(dr.CustomOp):
 
     def backward(self):
         of_pose = any(self.wanted[-POSE:])  # the pose also changes the rays' lengths, which multiply the image
-        prepared, straddling = self.known or self._look(deep=of_pose)
-        self.known = None
+        prepared, straddling = self.prepared or self._prepared_arrays(deep=of_pose)
+        self.prepared = None
         upstream: Any = self.grad_out()
-        found = _GATHER(
+        derivatives = _GATHER(
             *self.bend, *prepared, *self.inputs[-POSE:], upstream, image=of_pose, parts=self.parts, **self.settings
         )
         del prepared  # frees memory: as large as all that follows
-        gradients = _BY_INPUTS(*self.bend, *self.inputs, *found, wanted=self.wanted, **self.settings)
+        gradients = _BY_INPUTS(*self.bend, *self.inputs, *derivatives, wanted=self.wanted, **self.settings)
         if dr.width(straddling) and not self.settings['panel'].parallel:
             leaf = leaves(self.inputs)
             dr.backward_from(_with_rest(mi.Float(0), leaf, self.bend, self.settings, straddling) * upstream)
@@ -156,7 +156,7 @@ class _LineIntegrals(dr.CustomOp):
     def name(self):
         return 'line integrals'
 
-    def _look(self, deep=True):
+    def _prepared_arrays(self, deep=True):
         """The arrays for `splat.Plan`, and the indices of Gaussians that cannot be splatted. With `deep`, also sets the number
         of partial sums. Waits for the device."""
         *prepared, straddles, depth = _PREPARE(*self.bend, *self.inputs, **self.settings, deep=deep)
@@ -191,9 +191,9 @@ def _with_rest(image, inputs, bend, settings, indices):
 def _prepare(*arrays, deep, panel, options):
     """The arrays for `splat.Plan`; which Gaussians cannot be splatted, Bool [N]; the overlap depth if `deep`, else None."""
     view, f = _footprints(*arrays, panel=panel, options=options)
-    found = prepare(f.values, replace(f, values=()), options.sharing)
+    prepared = prepare(f.values, replace(f, values=()), options.sharing)
     shape = (view.width, view.height) if view.bend is None else (view.height, view.width)
-    return *found, f.straddles, deepest((f.column, f.row), f.area, shape) if deep else None
+    return *prepared, f.straddles, deepest((f.column, f.row), f.area, shape) if deep else None
 
 
 def _plan(prepared, view, options):
@@ -217,11 +217,11 @@ def _gather(*arrays, panel, options, image, parts):
 def _by_inputs(*arrays, wanted, **settings):
     """Derivatives by the inputs. `arrays`: the bend, the inputs, then the result of `_gather`."""
     bend, arrays = arrays[:2], arrays[2:]
-    inputs, (*found, by_lengths) = arrays[: len(wanted)], arrays[len(wanted) :]
+    inputs, (*derivatives, by_lengths) = arrays[: len(wanted)], arrays[len(wanted) :]
     dr.enable_grad([x for x, w in zip(inputs, wanted) if w])
     cut = Cuts()
     view, footprints = _footprints(*bend, *inputs, **settings, cut=cut)
-    ends, gradients = list(footprints.values), list(by_values(found, dr.detach(footprints.values[3])))
+    ends, gradients = list(footprints.values), list(by_values(derivatives, dr.detach(footprints.values[3])))
     if by_lengths is not None:
         ends, gradients = [*ends, view.lengths()], [*gradients, by_lengths]
     cut.pass_on(ends, gradients)

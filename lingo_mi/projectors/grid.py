@@ -155,8 +155,8 @@ def _leave_cell(target, weight, plane, step, size, on_x, on_y):
         j, k = i // 2, i % 2
         left = dr.select(on_x, weight[2 * j + k], dr.select(on_y, weight[4 * j + k], weight[4 * j + 2 * k]))
         dr.scatter_add(target, left, mi.UInt(index + j * a + k * b), mode=dr.ReduceMode.Direct)
-    kept = [(mi.Float(0) if i & bit else weight[i + bit]) for i in range(8) for bit in (4, 2, 1)]
-    return [dr.select(on_x, kept[3 * i], dr.select(on_y, kept[3 * i + 1], kept[3 * i + 2])) for i in range(8)]
+    weights = [(mi.Float(0) if i & bit else weight[i + bit]) for i in range(8) for bit in (4, 2, 1)]
+    return [dr.select(on_x, weights[3 * i], dr.select(on_y, weights[3 * i + 1], weights[3 * i + 2])) for i in range(8)]
 
 
 @dr.syntax

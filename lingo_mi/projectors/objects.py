@@ -33,20 +33,20 @@ def find_objects(scene: mi.Scene) -> list:
     InputError
         For an object that `lingo_xray` cannot integrate, and for a scene without objects.
     """
-    found = [thing for shape in scene.shapes() for thing in _objects(shape, scene)]
-    if not found:
+    objects = [obj for shape in scene.shapes() for obj in _objects(shape, scene)]
+    if not objects:
         raise InputError(
             'the scene has nothing that attenuates: add ellipsoids with a density, a cube with a '
             'heterogeneous medium or a closed mesh with a homogeneous one'
         )
-    return found
+    return objects
 
 
 def _objects(shape: mi.Shape, scene: mi.Scene) -> list:
     """What attenuates in a shape; an instance has what its group has, moved."""
     if shape.class_name() != 'Instance':
-        thing = _object(shape)
-        return [] if thing is None else [thing]
+        obj = _object(shape)
+        return [] if obj is None else [obj]
     # An instance does not tell its group: the name is read from its description, the group found among the scene's.
     name = re.findall(r'ShapeGroup\[\s*name = "(.*)"', str(shape))
     nodes = mi.traverse(scene).hierarchy
@@ -55,7 +55,7 @@ def _objects(shape: mi.Shape, scene: mi.Scene) -> list:
     if len(groups) != 1:
         raise InputError(f'lingo_xray does not find the shapegroup of the instance {shape.id()!r}: give each an id')
     inside = [node for node, (parent, _) in nodes.items() if parent is groups[0] and isinstance(node, mi.Shape)]
-    return [Instance(shape, thing) for part in inside if (thing := _object(part)) is not None]
+    return [Instance(shape, obj) for part in inside if (obj := _object(part)) is not None]
 
 
 def _object(shape: mi.Shape) -> Ellipsoids | GridInCube | HomogeneousMesh | None:
@@ -201,14 +201,14 @@ class Instance:
     integral is that of the object, times |D| / |M^-1 D|. Derivatives reach the object and the transform.
     """
 
-    def __init__(self, shape: mi.Shape, thing: Any):
-        self.name, self.thing = thing.name, thing
+    def __init__(self, shape: mi.Shape, content: Any):
+        self.name, self.content = content.name, content
         params: Any = mi.traverse(shape)
         self.to_world = params['to_world'].matrix
 
     def line_integrals(self, view: View, options: RenderOptions, primal: bool = True) -> Any:
         local, stretch = self._moved(view)
-        return self.thing.line_integrals(local, options, primal) * stretch
+        return self.content.line_integrals(local, options, primal) * stretch
 
     @full_float64()
     def _moved(self, view):

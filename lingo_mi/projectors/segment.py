@@ -31,8 +31,8 @@ def add_straddling(image: Any, gaussians: tuple, view: View, indices: Any) -> An
     """
     for k in range(dr.width(indices)):
         i = dr.gather(mi.UInt32, indices, dr.opaque(mi.UInt32, k))
-        one = [dr.gather(type(x), x, i) for x in gaussians]
-        image += _integrate(*one, view=view)
+        gaussian = [dr.gather(type(x), x, i) for x in gaussians]
+        image += _integrate(*gaussian, view=view)
         dr.eval(image)
     return image
 

@@ -175,9 +175,9 @@ class Plan:
         return image if self.packed.bend is None else turned(image, self.height, self.width)
 
 
-def by_values(found: Sequence, shear: Any) -> tuple:
+def by_values(derivatives: Sequence, shear: Any) -> tuple:
     """Convert the result of `Plan.gradient` to derivatives by `Footprints.values`. shear: one of these values."""
-    *others, x, y = found
+    *others, x, y = derivatives
     y = type(shear)(y) + shear * type(shear)(x)
     return tuple(type(shear)(v) if name in DOUBLE else v for name, v in zip(NAMES, (*others, x, y)))
 
@@ -215,9 +215,9 @@ class _Item:
         """t and d1 in pixels of the footprint."""
         return t, d1
 
-    def moments(self, found):
+    def moments(self, moments):
         """The moments of a row in t, with t in pixels of the footprint."""
-        return found
+        return moments
 
 
 class _InColumn(_Item):
@@ -246,8 +246,8 @@ class _InColumn(_Item):
     def in_its_pixels(self, t, d1):
         return t * self.scale, d1 / self.scale
 
-    def moments(self, found):
-        s, n0, n1, n2, q0, q1, q2 = found
+    def moments(self, moments):
+        s, n0, n1, n2, q0, q1, q2 = moments
         square = dr.square(self.scale)
         return s, n0, n1 * self.scale, n2 * square, q0, q1 * self.scale, q2 * square
 
@@ -310,8 +310,8 @@ def _draw(share: Share, target: Target, f: _Packed, moved=None):
     return share.each_item(draw)
 
 
-def _gather(share: Share, f: _Packed, upstream, found: Sums):
-    """Add the derivatives of sum(upstream * image) by the footprints' numbers to `found`."""
+def _gather(share: Share, f: _Packed, upstream, derivatives: Sums):
+    """Add the derivatives of sum(upstream * image) by the footprints' numbers to `derivatives`."""
 
     def gather(g, block, stop):
         item = _Item(g, f)
@@ -347,7 +347,7 @@ def _gather(share: Share, f: _Packed, upstream, found: Sums):
             return _add_row(sums, item, dy, here.moments(moments))
 
         sums = share.each_row(block, stop, item.row_end - item.row_begin, rows, *(mi.Float(0) for _ in NAMES))
-        found.add(sums, g)
+        derivatives.add(sums, g)
 
     return share.each_item(gather)
 

@@ -252,7 +252,7 @@ def _fill(share: Share, target: Target, f: _Packed):
     return share.each_item(draw)
 
 
-def _collect(share: Share, f: _Packed, upstream, found: Sums):
+def _collect(share: Share, f: _Packed, upstream, derivatives: Sums):
     def gather(g, block, stop):
         c, w, v = f.load(g)
 
@@ -272,7 +272,7 @@ def _collect(share: Share, f: _Packed, upstream, found: Sums):
             return _add_line(sums, c, dz, r, moments)
 
         sums = share.each_row(block, stop, w.w, lines, *(mi.Float(0) for _ in range(NUMBERS)))
-        found.add(sums, g)
+        derivatives.add(sums, g)
 
     return share.each_item(gather)
 

@@ -70,36 +70,38 @@ def open_dicom(path: Path, files: Iterable[Path]) -> Recording:
     InputError
         If a file is damaged, holds no projections, or is of another kind than the first.
     """
-    found: list[tuple[Any, Path, int, Any]] = []
+    entries: list[tuple[Any, Path, int, Any]] = []
     kind = None
     for file in sorted(files, key=by_number):
         header = read_dicom_file(file, pixels=False)
         if header is None:
             raise InputError(f'{file}: is not a DICOM file; export it again, or take it out of the folder')
-        own = _CT_PD if dicom_ct_pd.is_projection(header) else _XA
-        if kind not in (None, own):
-            raise InputError(f'{file}: is of another kind than {found[0][1].name}; put one scan in a folder of its own')
-        kind = own
+        reader = _CT_PD if dicom_ct_pd.is_projection(header) else _XA
+        if kind not in (None, reader):
+            raise InputError(
+                f'{file}: is of another kind than {entries[0][1].name}; put one scan in a folder of its own'
+            )
+        kind = reader
         if not header.get('Rows') or not header.get('Columns') or header.get('SamplesPerPixel', 1) != 1:
             raise InputError(f'{file}: has no image of one value a pixel; take it out of the folder')
         count = checked(file, lambda: int(header.get('NumberOfFrames') or 1))
         if not 1 <= count <= MOST_VIEWS:
             raise InputError(f'{file}: NumberOfFrames (0028,0008) must be from 1 to {MOST_VIEWS}, not {count}')
-        numbers = checked(file, lambda: own.numbers(file, header))
-        found.append((header.get('InstanceNumber'), file, count, numbers))
+        numbers = checked(file, lambda: reader.numbers(file, header))
+        entries.append((header.get('InstanceNumber'), file, count, numbers))
     assert kind is not None
-    if all(number is not None for number, *_ in found):
-        found.sort(key=lambda entry: int(entry[0]))
-    places = [(i, k) for i, (_, _, count, _) in enumerate(found) for k in range(count)]
+    if all(number is not None for number, *_ in entries):
+        entries.sort(key=lambda entry: int(entry[0]))
+    places = [(i, k) for i, (_, _, count, _) in enumerate(entries) for k in range(count)]
 
     def read(i):
         place, k = places[i]
-        _, file, count, numbers = found[place]
+        _, file, count, numbers = entries[place]
         return kind.values(numbers, _pixels(file, k if count > 1 else 0))
 
     first = read(0)
     views = Frames(str(path), len(places), first.shape, first.dtype, read)
-    taken = partial(kind.taken, path, [numbers for *_, numbers in found])
+    taken = partial(kind.taken, path, [numbers for *_, numbers in entries])
     return Recording(views, taken=taken, transmission=kind.transmission)
 
 

@@ -76,18 +76,18 @@ def numbers(file: Path, header: Any) -> _View:
     InputError
         If the image is not as large as the panel, or several frames are in one file.
     """
-    found = {name: _value(header, kind, tag) for name, (kind, tag) in ATTRIBUTES.items()}
+    values = {name: _value(header, kind, tag) for name, (kind, tag) in ATTRIBUTES.items()}
     if int(header.get('NumberOfFrames') or 1) != 1:
         raise InputError(f'{file}: holds several projections; write one file a projection, as DICOM-CT-PD has it')
     stored = int(header.Rows), int(header.Columns)
-    panel = tuple(int(needed(file, _named(name), found[name], 1)[0]) for name in _PANEL[:2])
+    panel = tuple(int(needed(file, _named(name), values[name], 1)[0]) for name in _PANEL[:2])
     if panel not in (stored, stored[::-1]):
         raise InputError(
             f'{file}: the panel has {panel} elements (rows, columns), but the image {stored} pixels; export it again'
         )
     return _View(
         file,
-        {name: value for name, value in found.items() if value is not None},
+        {name: value for name, value in values.items() if value is not None},
         _text(header, _SHAPE),
         float(header.get('RescaleSlope', 1)),
         float(header.get('RescaleIntercept', 0)),

@@ -31,10 +31,12 @@ def needed(where: Path | str, name: str, values: np.ndarray | None, count: int) 
     InputError
         If they are missing, more or fewer, or not finite.
     """
-    mend = 'say where the frames were taken: geometry=FILE'
+    remedy = 'say where the frames were taken: geometry=FILE'
     if values is None:
-        raise InputError(f'{where}: the DICOM attribute {name} is missing; {mend}')
+        raise InputError(f'{where}: the DICOM attribute {name} is missing; {remedy}')
     if values.shape != (count,) or not np.isfinite(values).all():
         wanted = 'one finite number' if count == 1 else f'{count} finite numbers'
-        raise InputError(f'{where}: the DICOM attribute {name} must be {wanted}, not {shown(values.tolist())}; {mend}')
+        raise InputError(
+            f'{where}: the DICOM attribute {name} must be {wanted}, not {shown(values.tolist())}; {remedy}'
+        )
     return values

@@ -151,8 +151,8 @@ def _angles(header, n):
     for name in _PRIMARY, _SECONDARY:
         start, steps = floats(header.get(name)), floats(header.get(name + 'Increment'))
         if 'PerFrameFunctionalGroupsSequence' in header:
-            found = [value for k in range(n) if (value := floats(_found(header, k, name))) is not None]
-            out[name] = np.concatenate(found) if len(found) == n else None
+            values = [value for k in range(n) if (value := floats(_found(header, k, name))) is not None]
+            out[name] = np.concatenate(values) if len(values) == n else None
         elif start is None or (steps is None and n > 1 and name == _PRIMARY):
             out[name] = None
         elif steps is None:

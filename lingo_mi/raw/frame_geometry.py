@@ -29,10 +29,10 @@ SCANNER_FILES: dict[str, Callable[[Path], Taken]] = {
     '.log': read_skyscan_log,  # Bruker
     '.pca': read_pca,  # GE, Waygate
 }
-KNOWN = ', '.join(('.yml', *SCANNER_FILES, '.xml (RTK)'))
+GEOMETRY_FILES = ', '.join(('.yml', *SCANNER_FILES, '.xml (RTK)'))
 
 
-def grid_given(geometry: PathLike | str | Geometry | None) -> bool:
+def has_grid(geometry: PathLike | str | Geometry | None) -> bool:
     """Whether it says how many voxels there are; else they are those of `grid_in_view`."""
     if isinstance(geometry, Geometry):
         return True
@@ -86,20 +86,22 @@ def geometry_of(
     voxels: dict[str, Any] = dict(nVoxel=[frames.shape[1], frames.shape[1], frames.shape[0]], dVoxel=1.0)
     if source is None:
         if recording.taken is None:
-            raise InputError(f'{frames.where}: does not say where its frames were taken; give geometry=FILE ({KNOWN})')
+            raise InputError(
+                f'{frames.where}: does not say where its frames were taken; give geometry=FILE ({GEOMETRY_FILES})'
+            )
         return _taken(recording.taken(), frames.where, options, angles, frames, voxels)
     path = Path(source)
     suffix = path.suffix.lower()
     if suffix == '.xml':
         if options.pixel is None:
             raise InputError(f"{path}: RTK's geometry says no size of pixels; give pixel=MM")
-        found = Geometry.from_rtk(path, nDetector=frames.shape, dDetector=options.pixel, **voxels)
-        _require_shape(found, frames, path)
-        return found, None, (-1, 1)
+        geometry = Geometry.from_rtk(path, nDetector=frames.shape, dDetector=options.pixel, **voxels)
+        _require_shape(geometry, frames, path)
+        return geometry, None, (-1, 1)
     if suffix in SCANNER_FILES:
         return _taken(SCANNER_FILES[suffix](path), path, options, angles, frames, voxels)
     if suffix not in ('.yml', '.yaml'):
-        raise InputError(f'{path}: is not a geometry file; give {KNOWN}')
+        raise InputError(f'{path}: is not a geometry file; give {GEOMETRY_FILES}')
     values = load_yaml(path)
     for name, wrong in dict(valid=True, I0=True, input=values.get('input') == 'intensity').items():
         if wrong and values.get(name) is not None:

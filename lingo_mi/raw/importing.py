@@ -13,7 +13,7 @@ from lingo_mi.common.memory import require_room
 from lingo_mi.common.progress import Progress
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.raw.beam import Beam
-from lingo_mi.raw.frame_geometry import cropped, geometry_of, grid_given, grid_in_view
+from lingo_mi.raw.frame_geometry import cropped, geometry_of, grid_in_view, has_grid
 from lingo_mi.raw.frames import open_recording
 from lingo_mi.raw.line_integrals import counts_to_line_integrals, photons_of_images
 from lingo_mi.raw.options import Options, chosen_views, exposures, region_of
@@ -52,37 +52,37 @@ def import_raw(
     views, n = recording.views, len(recording.views)
     flats = recording.flats if options.flats is None else open_recording(options.flats).views
     darks = recording.darks if options.darks is None else open_recording(options.darks).views
-    given, white, steps = geometry_of(geometry, options, recording)
+    whole, white, steps = geometry_of(geometry, options, recording)
     v0, v1, u0, u1 = crop = region_of('crop', options.crop, views.shape) or (0, views.shape[0], 0, views.shape[1])
     chosen, exposure = chosen_views(options.views, n), exposures(options.exposure, n)
     beam = Beam.of(path, options, views, flats, darks, 1.0 if recording.transmission else white)
 
     (nv, nu), (down, across) = views.shape, steps
     rows, columns = (v0, v1) if down > 0 else (nv - v1, nv - v0), (u0, u1) if across > 0 else (nu - u1, nu - u0)
-    out = cropped(given, (*rows, *columns))
+    out = cropped(whole, (*rows, *columns))
     bins = out.bins(options.binning)
     if options.binning > max(out.nDetector):
         raise InputError(f'binning {options.binning} is more than the {max(out.nDetector)} pixels of a view')
     out = out.binned(options.binning).subset(chosen)
-    if not grid_given(geometry):
+    if not has_grid(geometry):
         out = grid_in_view(out)
     if options.rings:
         require_enough(len(chosen), out.nDetector[1])
     # Line integrals and their mask, and the scan's copy of them without invalid pixels.
     require_room(9 * len(chosen) * float(np.prod(out.nDetector)), path)
 
-    def kept(image):  # before binning, which drops what is left over at the end
+    def in_crop(image):  # before binning, which drops what is left over at the end
         return image[v0:v1, u0:u1][::down, ::across]
 
     p = np.zeros((len(chosen), *out.nDetector), np.float32)
-    valid, levels, part = np.zeros(p.shape, bool), np.ones(len(chosen)), beam.panel.part(kept)
+    valid, levels, part = np.zeros(p.shape, bool), np.ones(len(chosen)), beam.panel.part(in_crop)
     light, clipped = np.zeros(len(chosen)), {}
     with Progress('Import', len(chosen), shown=progress) as bar:
         for k, i in enumerate(chosen):
             frame = views[i]
             levels[k] = beam.level(frame, float(exposure[i]))  # of the whole frame: air may lie outside the crop
             p[k], valid[k] = counts_to_line_integrals(
-                kept(frame), part, bins, float(exposure[i] * levels[k]), beam.limit, options.outliers
+                in_crop(frame), part, bins, float(exposure[i] * levels[k]), beam.limit, options.outliers
             )
             light[k] = np.exp(np.minimum(-p[k][valid[k]], 50)).sum() / valid[k].size  # no overflow
             highest = frame.max()

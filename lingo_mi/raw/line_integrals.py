@@ -46,10 +46,10 @@ class Fields:
     good: np.ndarray
     photons: float | None
 
-    def part(self, kept: Callable[[np.ndarray], np.ndarray]) -> Fields:
-        """What `kept` keeps of each image."""
-        flat = None if self.flat is None else kept(self.flat)
-        return replace(self, dark=kept(self.dark), flat=flat, good=kept(self.good))
+    def part(self, region: Callable[[np.ndarray], np.ndarray]) -> Fields:
+        """What `region` keeps of each image."""
+        flat = None if self.flat is None else region(self.flat)
+        return replace(self, dark=region(self.dark), flat=flat, good=region(self.good))
 
 
 def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None, saturation: float = np.inf) -> Fields:
@@ -119,7 +119,7 @@ def _near(dark, signal):
 
 def counts_to_line_integrals(
     view: np.ndarray,
-    known: Fields,
+    fields: Fields,
     bins: tuple[int, int],
     exposure: float = 1.0,
     saturation: float = np.inf,
@@ -142,9 +142,9 @@ def counts_to_line_integrals(
     outliers : bool
         Whether `bright_outliers` are left out.
     """
-    counts = view - known.dark
-    good = known.good & np.isfinite(counts) & (view < saturation)
-    full = np.full(view.shape, exposure) if known.flat is None else known.flat * exposure
+    counts = view - fields.dark
+    good = fields.good & np.isfinite(counts) & (view < saturation)
+    full = np.full(view.shape, exposure) if fields.flat is None else fields.flat * exposure
     if outliers:
         good &= ~bright_outliers(counts, full, good)
     bv, bu = bins

@@ -60,7 +60,7 @@ def read_numbers(path: PathLike | str) -> np.ndarray:
     InputError
         If none is left, for a line that goes on with something else, and for decimal commas.
     """
-    found = []
+    values = []
     with reading(path):
         lines = Path(path).read_text(encoding='utf-8', errors='replace').splitlines()
     if _decimal_commas(lines):
@@ -68,13 +68,13 @@ def read_numbers(path: PathLike | str) -> np.ndarray:
     for number, line in enumerate(lines, 1):
         cells = line.replace(':', ' ').replace(',', ' ').replace(';', ' ').split()[:2]  # times may follow
         try:
-            found += [float(cell) for cell in cells][-1:]
+            values += [float(cell) for cell in cells][-1:]
         except ValueError:
             if _is_number(cells[0]):
                 raise InputError(f'{path}: line {number} has {shown(cells[1])} where a number must be') from None
-    if not found or not np.isfinite(found).all():
+    if not values or not np.isfinite(values).all():
         raise InputError(f'{path}: holds no numbers; write one a line')
-    return np.array(found)
+    return np.array(values)
 
 
 def _decimal_commas(lines):

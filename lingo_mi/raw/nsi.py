@@ -36,21 +36,21 @@ def read_nsipro(path: PathLike | str) -> Taken:
 
     def value(section, name):
         inside = re.search(rf'<{section}>(.*?)</{section}>', text, re.DOTALL)
-        found = re.search(rf'<{name}>([^<\r\n]*)', inside[1]) if inside else None
-        if found is None or not found[1].strip():
+        match = re.search(rf'<{name}>([^<\r\n]*)', inside[1]) if inside else None
+        if match is None or not match[1].strip():
             raise InputError(f'{path}: {name} of <{section}> is missing; give the .nsipro of the scan')
-        return found[1].strip()
+        return match[1].strip()
 
     def numbers(section, name, count):
         try:
-            found = np.array(value(section, name).split(), float)
+            vector = np.array(value(section, name).split(), float)
         except ValueError:
-            found = np.full(1, np.nan)
-        if found.shape != (count,) or not np.isfinite(found).all():
+            vector = np.full(1, np.nan)
+        if vector.shape != (count,) or not np.isfinite(vector).all():
             raise InputError(
                 f'{path}: {name} of <{section}> must be {count} number{"s" * (count > 1)}, not {shown(value(section, name))}'
             )
-        return found
+        return vector
 
     source, reference, axis, normal, along = (
         numbers('Result', name, 3) for name in ('source', 'reference', 'axis', 'normal', 'horizontal')
@@ -73,9 +73,9 @@ def read_nsipro(path: PathLike | str) -> Taken:
     frame = np.stack([x, np.cross(up, x), up])
     u, v = frame @ along * across, frame @ np.cross(normal, along) * down
     corner = frame @ reference - (u + v) / 2
-    one = Rays(*(np.tile(vector, (int(n), 1)) for vector in (frame @ source, corner, u, v)), parallel=False)
+    first = Rays(*(np.tile(vector, (int(n), 1)) for vector in (frame @ source, corner, u, v)), parallel=False)
     sense = 1 if value('Processed', 'clockwise') == 'True' else -1
-    rays = one.moved(rotation('z', np.radians(sense * step * np.arange(int(n)))))
+    rays = first.moved(rotation('z', np.radians(sense * step * np.arange(int(n)))))
     geometry = Geometry.from_poses(rays, (rows, columns), grid=Grid((columns, columns, rows), 1.0))
     flip_v, flip_h = (-1 if flip != (turned == 180) else 1 for flip in flips)
     return Taken(geometry, columns=flip_h, rows=flip_v)

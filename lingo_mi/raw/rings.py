@@ -41,11 +41,11 @@ def ring_offsets(projections: np.ndarray, valid: np.ndarray | None = None) -> np
     """
     n, rows, columns = projections.shape
     require_enough(n, columns)
-    found = np.zeros((rows, columns), np.float32)
+    offsets = np.zeros((rows, columns), np.float32)
     for row in range(rows):
         inside = None if valid is None else valid[:, row]
-        found[row] = _of_row(projections[:, row].astype(float), inside)
-    return found
+        offsets[row] = _of_row(projections[:, row].astype(float), inside)
+    return offsets
 
 
 def require_enough(n: int, columns: int) -> None:
@@ -61,11 +61,11 @@ def _of_row(sinogram: np.ndarray, valid: np.ndarray | None) -> np.ndarray:
     """The offsets [u] of one row of the panel, whose line integrals are [view, u]."""
     if valid is not None and not valid.all():
         sinogram = np.array([_without_gaps(*view) for view in zip(sinogram, valid)])
-    found = np.zeros(sinogram.shape[1])
+    offsets = np.zeros(sinogram.shape[1])
     for _ in range(PASSES):
-        left = sinogram - found
-        found += np.median(left - np.asarray(savgol_filter(left, WINDOW, DEGREE, axis=1)), 0)
-    return found if valid is None else np.where(2 * valid.sum(0) >= len(valid), found, 0)
+        left = sinogram - offsets
+        offsets += np.median(left - np.asarray(savgol_filter(left, WINDOW, DEGREE, axis=1)), 0)
+    return offsets if valid is None else np.where(2 * valid.sum(0) >= len(valid), offsets, 0)
 
 
 def _without_gaps(values: np.ndarray, valid: np.ndarray) -> np.ndarray:

@@ -86,8 +86,8 @@ class Chosen(Reconstruction):
             size = ' x '.join(f'{d / trial.finer:.4g}' for d in self.spacing)
             mark = '*' if i == self.taken else ' '
             how = f'{trial.niter:2} passes' if trial.strength is None else f'strength {trial.strength:g}'
-            given = '' if trial.given is None else f', {trial.given:.5f} as given out'
-            lines.append(f'{mark} {trial.name:22} voxels {size} mm, {how}: {trial.score:.5f}{given}')
+            output = '' if trial.output_score is None else f', {trial.output_score:.5f} as given out'
+            lines.append(f'{mark} {trial.name:22} voxels {size} mm, {how}: {trial.score:.5f}{output}')
         return '\n'.join(lines)
 
     def record(self) -> dict[str, Any]:
@@ -224,91 +224,93 @@ class Best(Algorithm):
         if self.cloud and fit is None:
             raise InputError('best tries a cloud where it is given a function that fits one: use lm.reconstruct')
         began, count = time.perf_counter(), self._counter(progress, self.steps(scan))
-        kept, held_out = split_views(scan, self.held_out)
-        plan = self._plan(kept, held_out, count, fit if self.cloud else None)
+        train, held_out = split_views(scan, self.held_out)
+        plan = self._plan(train, held_out, count, fit if self.cloud else None)
         gc.collect()
         dr.flush_malloc_cache()  # two thirds of the memory that the trials took
-        chosen = self._judged(plan, kept, held_out, count)
+        chosen = self._judged(plan, train, held_out, count)
         if chosen.score > DOUBTFUL:
             warnings.warn(
                 f'views that are held out are predicted badly (error {chosen.score:.2g}; 0 is exact, 1 an empty volume): unless '
                 'they are few or very noisy, check geometry, angles and order of the views',
                 stacklevel=3,
             )
-        found = self._apply(scan, chosen, count, fit)
+        result = self._apply(scan, chosen, count, fit)
         assert chosen.volume is not None  # of its best pass
-        tried, volume = (self._given(v, chosen.finer) for v in (chosen.volume, found.volume))
+        tried, volume = (self._output(v, chosen.finer) for v in (chosen.volume, result.volume))
         if progress is not None:
-            progress(self.steps(scan), self.steps(scan), found.residuals[-1])
+            progress(self.steps(scan), self.steps(scan), result.residuals[-1])
         for trial in plan:
             trial.volume = None
-        own = scan.geometry.grid
+        grid = scan.geometry.grid
         return Chosen(
             volume,
-            found.residuals,
+            result.residuals,
             time.perf_counter() - began,
-            own.finer(chosen.finer) if self.voxels == 'finer' else own,
+            grid.finer(chosen.finer) if self.voxels == 'finer' else grid,
             tuple(plan),
             next(i for i, trial in enumerate(plan) if trial is chosen),
             error_map(volume, tried),
             'means' if self.voxels == 'means' and chosen.finer > 1 else 'values',
-            own.spacing,
+            grid.spacing,
         )
 
-    def _given(self, volume: np.ndarray, finer: int) -> np.ndarray:
-        """A setting's volume as it is given out."""
+    def _output(self, volume: np.ndarray, finer: int) -> np.ndarray:
+        """The volume of a setting in the voxels of the result."""
         if finer == 1 or self.voxels == 'finer':
             return volume
         return means(volume, finer) if self.voxels == 'means' else values(means(volume, finer))
 
-    def _judged(self, plan: list[Trial], kept: Scan, held_out: Scan, count) -> Trial:
+    def _judged(self, plan: list[Trial], train: Scan, held_out: Scan, count) -> Trial:
         """The trial to apply. ASD-POCS itself gets all its passes first, where it may be given out."""
         chosen = min(_best(plan[1:]), plan[0], key=lambda trial: trial.score)
         if self.voxels != 'values' and chosen is not plan[0]:
             return chosen
         if len(plan[0].scores) == START:  # it could go on
-            plan[0] = self._plain(kept, held_out, count, LONG)
+            plan[0] = self._plain(train, held_out, count, LONG)
         if self.voxels != 'values':
             return min(_best(plan[1:]), plan[0], key=lambda trial: trial.score)
         score = Score(held_out)
         for trial in plan:
             if trial.volume is not None:
-                trial.given = score(uploaded(self._given(trial.volume, trial.finer)))
-        return min(plan, key=lambda trial: np.inf if trial.given is None else trial.given)
+                trial.output_score = score(uploaded(self._output(trial.volume, trial.finer)))
+        return min(plan, key=lambda trial: np.inf if trial.output_score is None else trial.output_score)
 
-    def _plain(self, kept: Scan, held_out: Scan, count, niter: int) -> Trial:
+    def _plain(self, train: Scan, held_out: Scan, count, niter: int) -> Trial:
         plain = Trial(PLAIN, 1)
         ASDPOCS(niter=niter, seed=self.seed)._run(
-            kept, progress=count, watch=TrialWatch(Score(held_out), plain, slow=True)
+            train, progress=count, watch=TrialWatch(Score(held_out), plain, slow=True)
         )
         return plain
 
-    def _plan(self, kept: Scan, held_out: Scan, count, fit: Fit | None) -> list[Trial]:
-        plain = self._plain(kept, held_out, count, START)
+    def _plan(self, train: Scan, held_out: Scan, count, fit: Fit | None) -> list[Trial]:
+        plain = self._plain(train, held_out, count, START)
         plan = [plain]
-        own = self._try(kept, held_out, plain, _refined(1), count, by=TRIAL)
-        plan.append(own)
+        scan_voxels = self._try(train, held_out, plain, _refined(1), count, by=TRIAL)
+        plan.append(scan_voxels)
         if self.finer > 1:
-            plan.append(self._try(kept, held_out, plain, _refined(self.finer), count, beat=own.score, by=TRIAL))
-        ahead = any(min(trial.scores[:TRIAL]) < AHEAD * own.score for trial in plan[2:])
-        if not ahead and own.niter == TRIAL < self.niter:  # it was cut short, and may gain from a longer start
-            plan[0] = self._plain(kept, held_out, count, LONG)
-            plan[1] = self._try(kept, held_out, plan[0], _refined(1), count)
+            plan.append(
+                self._try(train, held_out, plain, _refined(self.finer), count, beat=scan_voxels.score, by=TRIAL)
+            )
+        ahead = any(min(trial.scores[:TRIAL]) < AHEAD * scan_voxels.score for trial in plan[2:])
+        if not ahead and scan_voxels.niter == TRIAL < self.niter:  # it was cut short, and may gain from a longer start
+            plan[0] = self._plain(train, held_out, count, LONG)
+            plan[1] = self._try(train, held_out, plan[0], _refined(1), count)
         best = _best(plan[1:])
         if best.score > LITTLE * best.scores[0]:
             from_ = plan[0] if best.finer == 1 else plain
             smooth = _refined(best.finer, smooth=True)
-            plan.append(self._try(kept, held_out, from_, smooth, count))
+            plan.append(self._try(train, held_out, from_, smooth, count))
             best = _best(plan[1:])
         if self.prior is not None:
-            strength, volume, scores, _ = self._penalised(None).search(kept, held_out, None, count, TRIED * MOST)
+            strength, volume, scores, _ = self._penalised(None).search(train, held_out, None, count, TRIED * MOST)
             plan.append(Trial(f'pls, {type(self.prior).__name__}', 1, scores=scores, volume=volume, strength=strength))
         if fit is not None:
             for trial in plan[1:]:
                 if trial is not best and trial.strength is None:
                     trial.volume = None  # room for the fit
-            cloud = Trial('cloud', best.finer, volume=self._cloud(kept, best.finer, fit, count))
-            plan.append(self._try(kept, held_out, cloud, _refined(best.finer, best.smooth, cloud=True), count))
+            cloud = Trial('cloud', best.finer, volume=self._cloud(train, best.finer, fit, count))
+            plan.append(self._try(train, held_out, cloud, _refined(best.finer, best.smooth, cloud=True), count))
         return plan
 
     def _penalised(self, strength: float | None) -> PenalisedLeastSquares:
@@ -324,14 +326,14 @@ class Best(Algorithm):
 
         return fit(scan, progress)(scan.geometry.grid.finer(finer))
 
-    def _try(self, kept, held_out, start: Trial, trial: Trial, count, beat=None, by=0) -> Trial:
+    def _try(self, train, held_out, start: Trial, trial: Trial, count, beat=None, by=0) -> Trial:
         """Refine the volume of another trial."""
         assert start.volume is not None  # of its best pass
         trial.before = start.niter if start.name == PLAIN else 0
         score = Score(held_out.on(held_out.geometry.grid.finer(trial.finer)))
         niter = min(by, self.niter) if by and beat is None else self.niter
         refine(
-            kept, start.volume, niter, trial.finer, trial.smooth, self.seed, count, TrialWatch(score, trial, beat, by)
+            train, start.volume, niter, trial.finer, trial.smooth, self.seed, count, TrialWatch(score, trial, beat, by)
         )
         return trial
 

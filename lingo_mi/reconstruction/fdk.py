@@ -298,7 +298,7 @@ class FDK(Algorithm):
         """
         parts = scan.geometry.grid.slabs(thickness)
         check_memory(scan.geometry.on(scan.geometry.grid.slab(*parts[0])), needed=_slab_memory(scan, parts[0][1]))
-        found, geometry = self.filtered_views(scan)
+        views, geometry = self.filtered_views(scan)
         n = len(geometry)
         for k, part in enumerate(parts):
 
@@ -307,7 +307,7 @@ class FDK(Algorithm):
                     progress(k * n + done, len(parts) * n, None)
 
             slab = geometry.on(geometry.grid.slab(*part))
-            yield backprojected(slab, lambda first: found[first : first + BATCH], report)
+            yield backprojected(slab, lambda first: views[first : first + BATCH], report)
 
     def filtered_views(
         self, scan: Scan, empty: Callable[[tuple[int, int, int]], np.ndarray] | None = None
@@ -327,10 +327,10 @@ class FDK(Algorithm):
         projections, geometry = _weighted(with_every_pixel(scan) if self.fill else scan)
         n_v, n_u = geometry.nDetector
         shape = len(geometry), n_u, n_v
-        found = np.empty(shape, np.float32) if empty is None else empty(shape)
+        views = np.empty(shape, np.float32) if empty is None else empty(shape)
         for first in range(0, len(geometry), BATCH):
-            found[first : first + BATCH] = filtered(projections(first), geometry, self.filter).transpose(0, 2, 1)
-        return found, geometry
+            views[first : first + BATCH] = filtered(projections(first), geometry, self.filter).transpose(0, 2, 1)
+        return views, geometry
 
     def slab_steps(self, scan: Scan, thickness: int) -> int:
         """The number of steps of `slabs`, for `progress`."""

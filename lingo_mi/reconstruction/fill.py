@@ -34,12 +34,12 @@ def filled(scan: Scan) -> Scan:
     moves = max(1.0, float(step) * p.shape[2] / 2)  # pixels from view to view
     alone = np.zeros(p.shape, bool)
     for row in np.flatnonzero(~valid.all((0, 2))):
-        values, known = p[:, row], valid[:, row]
-        along, apart = _between(values, known)
-        over, views_apart = (x.T for x in _between(values.T, known.T))
+        values, valid_row = p[:, row], valid[:, row]
+        along, apart = _between(values, valid_row)
+        over, views_apart = (x.T for x in _between(values.T, valid_row.T))
         a, b = 1 / apart, 1 / (moves * views_apart)
-        alone[:, row] = ~known & (a + b == 0)
-        p[:, row] = np.where(known, values, (a * along + b * over) / np.maximum(a + b, 1e-12))
+        alone[:, row] = ~valid_row & (a + b == 0)
+        p[:, row] = np.where(valid_row, values, (a * along + b * over) / np.maximum(a + b, 1e-12))
     if alone.any():  # no valid pixel in the row, nor in other views: the nearest
         nearest = np.asarray(ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True))
         p[alone] = scan.projections[tuple(nearest)][alone]
@@ -52,17 +52,17 @@ def filled(scan: Scan) -> Scan:
     return replace(scan, projections=p, valid=None)
 
 
-def _between(values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _between(values: np.ndarray, valid: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Linear interpolation along the last axis, and the distance between the known values on either side; beyond the last, its
     value, and twice the distance from it."""
     n = values.shape[-1]
     at = np.broadcast_to(np.arange(n), values.shape)
-    before = np.maximum.accumulate(np.where(known, at, -1), -1)
-    after = np.minimum.accumulate(np.where(known, at, n)[..., ::-1], -1)[..., ::-1]
+    before = np.maximum.accumulate(np.where(valid, at, -1), -1)
+    after = np.minimum.accumulate(np.where(valid, at, n)[..., ::-1], -1)[..., ::-1]
     first, last = (np.take_along_axis(values, np.clip(x, 0, n - 1), -1) for x in (before, after))
     left, right = before >= 0, after < n
     apart = np.maximum(after - before, 1)
     share = (at - before) / apart
     value = np.where(left & right, first + share * (last - first), np.where(left, first, last))
-    one = 2 * np.where(left, at - before, after - at)
-    return value, np.where(left & right, apart, np.where(left | right, np.maximum(one, 1), NOWHERE)).astype(float)
+    one_sided = 2 * np.where(left, at - before, after - at)
+    return value, np.where(left & right, apart, np.where(left | right, np.maximum(one_sided, 1), NOWHERE)).astype(float)

@@ -77,7 +77,7 @@ class Trial:
         `Score` of the held-out views after every pass; of a prior, of every strength.
     volume : ndarray or None
         After the pass with the lowest score, on the setting's own voxels.
-    given : float or None
+    output_score : float or None
         `Score` of the numbers that would be given out, where these decide, else None.
     strength : float or None
         Of a prior, else None.
@@ -91,7 +91,7 @@ class Trial:
     cloud: bool = False
     scores: list[float] = field(default_factory=list)
     volume: np.ndarray | None = None
-    given: float | None = None
+    output_score: float | None = None
     strength: float | None = None
     before: int = 0
 
@@ -113,7 +113,7 @@ class Trial:
             niter=self.niter,
             score=self.score,
             scores=self.scores,
-            given=self.given,
+            given=self.output_score,
             strength=self.strength,
             before=self.before,
         )

@@ -117,14 +117,14 @@ class PenalisedLeastSquares(Algorithm):
 
     def _run(self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None) -> Reconstruction:
         """Reconstruct the volume of a scan, see `run_algorithm`."""
-        began, own = time.perf_counter(), scan.geometry.grid
+        began, grid = time.perf_counter(), scan.geometry.grid
         if start is not None and self.finer > 1:
             start = np.repeat(np.repeat(np.repeat(start, self.finer, 0), self.finer, 1), self.finer, 2)
-        scan, done = scan.on(own.finer(self.finer)), 0
+        scan, done = scan.on(grid.finer(self.finer)), 0
         strength = self.strength
         if strength is None:
-            kept, held_out = split_views(scan, self.held_out)
-            strength, start, _, done = self.search(kept, held_out, start, progress, self.steps(scan))
+            train, held_out = split_views(scan, self.held_out)
+            strength, start, _, done = self.search(train, held_out, start, progress, self.steps(scan))
         solver = self._solver(scan)
         x = solver.system.start(start)
         residuals = [solver.system.residual(x)[1]]
@@ -138,7 +138,7 @@ class PenalisedLeastSquares(Algorithm):
         x = solver.minimise(x, strength, self.niter, after_step)
         residuals = [*residuals[:1], *residuals[2:], solver.system.residual(x)[1]]  # a step knows that where it began
         volume = means(solver.system.volume(x), self.finer) if self.finer > 1 else solver.system.volume(x)
-        return Reconstruction(volume, residuals, time.perf_counter() - began, own)
+        return Reconstruction(volume, residuals, time.perf_counter() - began, grid)
 
     def _solver(self, scan: Scan) -> Solver:
         return Solver(
@@ -146,7 +146,7 @@ class PenalisedLeastSquares(Algorithm):
         )
 
     def search(
-        self, kept: Scan, held_out: Scan, start: ArrayLike | None, progress: Progress | None, steps: int
+        self, train: Scan, held_out: Scan, start: ArrayLike | None, progress: Progress | None, steps: int
     ) -> tuple[float, np.ndarray, list[float], int]:
         """The strongest prior that predicts held-out views nearly as well as the best, the volume of the best, all scores, and
         the steps done.
@@ -160,7 +160,7 @@ class PenalisedLeastSquares(Algorithm):
         steps : int
             For `progress`.
         """
-        score, solver = Score(held_out), self._solver(kept)
+        score, solver = Score(held_out), self._solver(train)
         scores: dict[int, float] = {}
         best, done = solver.system.start(start), 0
 
@@ -173,10 +173,10 @@ class PenalisedLeastSquares(Algorithm):
         def tried(i: int, x: mi.Float) -> mi.Float:
             nonlocal best
             x = solver.minimise(x, PATH[i], TRIED, after_step)
-            found = score(x)
-            if found < min(scores.values(), default=math.inf):
+            value = score(x)
+            if value < min(scores.values(), default=math.inf):
                 best = x
-            scores[i] = found
+            scores[i] = value
             return x
 
         x, i, trials = tried(FIRST, best), FIRST, 1
@@ -210,8 +210,8 @@ class Solver:
     def __init__(self, system: System, prior: Prior, upper: float, weighted: bool = False):
         self.system, self.prior, self.upper, self.weights = system, prior, upper, None
         if weighted:
-            kept = dr.exp(-dr.maximum(system.b, 0))
-            self.weights = evaluated(kept * (len(system.views) * system.A.pixels / dr.sum(kept)))
+            photons = dr.exp(-dr.maximum(system.b, 0))
+            self.weights = evaluated(photons * (len(system.views) * system.A.pixels / dr.sum(photons)))
         self.curvature = SAFE * _Rooted(self).norm(ACCURACY) ** 2 or 1.0
         self.scale = float(dr.max(system.A.adjoint(self.weighed(system.b), system.views))[0])
         self.residual = math.nan

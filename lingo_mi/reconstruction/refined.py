@@ -148,7 +148,7 @@ class Refined(Algorithm):
             volume = _on_completed(
                 completed, self.completed_niter, volume, blur, self.seed, _continued(progress, 0, steps)
             )
-        found = self.on_measured()._run(
+        result = self.on_measured()._run(
             scan,
             start=volume,
             progress=_continued(progress, self.completed_niter, steps),
@@ -156,7 +156,7 @@ class Refined(Algorithm):
             blur=blur,
         )
         return Reconstruction(
-            means(found.volume, self.finer), found.residuals, time.perf_counter() - began, geometry.grid
+            means(result.volume, self.finer), result.residuals, time.perf_counter() - began, geometry.grid
         )
 
     def on_measured(self) -> ASDPOCS:

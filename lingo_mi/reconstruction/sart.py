@@ -142,11 +142,11 @@ class Sweeps(Algorithm):
             if how.tol and residuals[-1] <= how.tol:
                 break
             x = sweep(system, x, how.lmbda * how.lmbda_red**k, next(order), how.noneg)
-            known = how.tol or k + 1 == how.niter
-            residuals.append(system.residual(x)[1] if known else np.nan)
+            measured = how.tol or k + 1 == how.niter
+            residuals.append(system.residual(x)[1] if measured else np.nan)
             dr.sync_thread()  # Ctrl-C comes through between passes
             if progress:
-                progress(k + 1, how.niter, residuals[-1] if known else None)
+                progress(k + 1, how.niter, residuals[-1] if measured else None)
         return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry.grid)
 
     def slabs(

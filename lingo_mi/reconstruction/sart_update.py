@@ -12,7 +12,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from lingo_mi.common.runtime import one_at_a_time
+from lingo_mi.common.runtime import drjit_lock
 from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.replay import Replay
 from lingo_mi.projectors.stack import Block, Views
@@ -26,7 +26,7 @@ def update(system: System, x: mi.Float, views: Views, lmbda: float, noneg: bool)
     if isinstance(A, GridPair):
         return _update(A, views, step, noneg, *volumes)
     block = Block.of(views)
-    with one_at_a_time():
+    with drjit_lock():
         return _REPLAY(
             block.numbers, block.count, step, *volumes, *A.arrays, kind=type(A), settings=A.settings, noneg=noneg
         )

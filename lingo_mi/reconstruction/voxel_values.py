@@ -26,10 +26,10 @@ def values(mean: np.ndarray) -> np.ndarray:
 
     By Van Cittert's iteration v <- v + mean - B v (Z. Phys. 69, 1931). Beside edges they may be negative.
     """
-    found = mean
+    centres = mean
     for _ in range(STEPS):
-        found = found + mean - cube_means(found)
-    return found.astype(np.float32)
+        centres = centres + mean - cube_means(centres)
+    return centres.astype(np.float32)
 
 
 def cube_means(value: np.ndarray) -> np.ndarray:

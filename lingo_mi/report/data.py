@@ -79,8 +79,8 @@ class ReportData:
     @cached_property
     def quantity(self) -> str:
         """What the volume holds, with its unit: see `quantity_of`."""
-        known = self.volume if self.truth is None else self.truth
-        return REAL if known is None else quantity_of(known, self.preview * np.asarray(self.spacing))
+        volume = self.volume if self.truth is None else self.truth
+        return REAL if volume is None else quantity_of(volume, self.preview * np.asarray(self.spacing))
 
     @property
     def reference(self) -> str:

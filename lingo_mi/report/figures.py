@@ -125,8 +125,8 @@ def draw_views(fig: Any, data: Any) -> None:
         return
     kinds = {'Rendered': data.views[chosen]}
     if data.views_truth is not None:
-        given = data.views_truth[chosen]
-        kinds |= {data.reference: given, 'Residual': data.views[chosen] - given}
+        reference = data.views_truth[chosen]
+        kinds |= {data.reference: reference, 'Residual': data.views[chosen] - reference}
     low, high = grey_range(*(v for k, v in kinds.items() if k != 'Residual'))
     extent = (-nu * du / 2, nu * du / 2, nv * dv / 2, -nv * dv / 2)
     grid = fig.subplots(len(kinds), len(chosen), squeeze=False)
@@ -240,12 +240,12 @@ def draw_curves(fig: Any, data: Any) -> None:
     names = {'psnr_2d': '2D, held-out views', 'psnr_3d': '3D, volume'}
     columns = [('iteration', 'iteration'), ('seconds', 'time [s]')]
 
-    def known(x, key):
+    def has_points(x, key):
         return len(series(data.history, x, key)[0]) > 0
 
-    rows = [(label, [key for key in keys if known('iteration', key)]) for label, keys in rows]
+    rows = [(label, [key for key in keys if has_points('iteration', key)]) for label, keys in rows]
     rows = [(label, keys) for label, keys in rows if keys]
-    columns = [c for c in columns if any(known(c[0], key) for _, keys in rows for key in keys)]
+    columns = [c for c in columns if any(has_points(c[0], key) for _, keys in rows for key in keys)]
     grid = fig.subplots(len(rows), len(columns), squeeze=False, sharex='col', sharey='row')
     for i, (label, keys) in enumerate(rows):
         for j, (x, _) in enumerate(columns):
@@ -298,9 +298,9 @@ def overview(data: Any, headline: str, width: float = 19.0, dpi: int = 100) -> b
         shown = dict(ha='center', va='center', parse_math=False)  # a name may have dollars
         parts[0].text(0.5, 0.66, data.title, fontsize=20, weight='bold', **shown)
         parts[0].text(0.5, 0.2, headline, fontsize=13, color='#333333', **shown)
-        for part, row, share, own, height in zip(parts[1:], rows, shares, heights, tallest):
+        for part, row, share, heights_of_row, height in zip(parts[1:], rows, shares, heights, tallest):
             for sub, section, h in zip(
-                np.ravel(part.subfigures(1, len(row), wspace=0.03, width_ratios=share)), row, own
+                np.ravel(part.subfigures(1, len(row), wspace=0.03, width_ratios=share)), row, heights_of_row
             ):
                 if h < 0.9 * height:  # align a lower section with the top of its neighbour
                     sub = sub.subfigures(2, 1, height_ratios=[h, height - h])[0]

@@ -125,11 +125,11 @@ LISTED = {
 
 def headline(metrics: dict) -> str:
     """The main numbers with units on one line, without missing ones and NaN."""
-    known = [(text, key) for key, text in HEADLINE.items() if is_known(metrics.get(key))]
-    return '   ·   '.join(text.format(as_text(key, metrics[key])) for text, key in known)
+    shown = [(text, key) for key, text in HEADLINE.items() if has_value(metrics.get(key))]
+    return '   ·   '.join(text.format(as_text(key, metrics[key])) for text, key in shown)
 
 
-def is_known(value: object) -> bool:
+def has_value(value: object) -> bool:
     """Whether there is something to show: neither None nor NaN."""
     return not (value is None or isinstance(value, (float, np.floating)) and math.isnan(value))
 
@@ -140,10 +140,10 @@ def as_text(key: str, value: object) -> str:
         return ', '.join(f'{k} {as_text("", v)}' for k, v in value.items())
     if isinstance(value, (list, tuple, np.ndarray)):
         return ', '.join(as_text('', v) for v in value)
-    if not is_known(value):
+    if not has_value(value):
         return '–'
-    known = QUALITY.get(key) or SETTINGS.get(key)
-    unit, form = (known.unit, known.form) if known else ('', '')
+    number = QUALITY.get(key) or SETTINGS.get(key)
+    unit, form = (number.unit, number.form) if number else ('', '')
     if isinstance(value, (bool, str)):
         return str(value)
     if form:

@@ -38,8 +38,10 @@ class Arrays(dict[str, Packed]):
 
     def __init__(self, earlier: Arrays | None = None):
         super().__init__()
-        self._given: dict[str, tuple[np.ndarray, float, float, int]] = {}
-        self._earlier = {} if earlier is None else {name: (earlier._given[name], p) for name, p in earlier.items()}
+        self._packed_from: dict[str, tuple[np.ndarray, float, float, int]] = {}
+        self._earlier = (
+            {} if earlier is None else {name: (earlier._packed_from[name], p) for name, p in earlier.items()}
+        )
 
     def scale(self, name: str, low: float, high: float) -> tuple[float, float]:
         """The range to pack an array with: [low, high], or the one of before where that holds it and is not too wide."""
@@ -52,9 +54,9 @@ class Arrays(dict[str, Packed]):
 
     def add(self, name: str, array: np.ndarray, low: float, high: float, bits: int = 16) -> None:
         """Pack an array (see `pack`), unless it was the same before."""
-        self._given[name] = array, low, high, bits
-        given, packed = self._earlier.get(name, (None, None))
-        same = given is not None and given[1:] == (low, high, bits) and np.array_equal(given[0], array)
+        self._packed_from[name] = array, low, high, bits
+        before, packed = self._earlier.get(name, (None, None))
+        same = before is not None and before[1:] == (low, high, bits) and np.array_equal(before[0], array)
         self[name] = packed if same and packed is not None else quantised(array, low, high, bits)
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from lingo_mi.report import figures, template
 from lingo_mi.report.data import ReportData
-from lingo_mi.report.numbers import LISTED, QUALITY, SETTINGS, as_text, headline, is_known
+from lingo_mi.report.numbers import LISTED, QUALITY, SETTINGS, as_text, has_value, headline
 from lingo_mi.report.payload import colour_maps, history, payload
 from lingo_mi.storage.file_access import replacing, write_text
 from lingo_mi.storage.output_folder import PAGE, PICTURE
@@ -33,10 +33,10 @@ def write_report(folder: PathLike | str, data: ReportData) -> Path:
 
 def report_page(data: ReportData) -> str:
     """The page of a report, as text."""
-    known, arrays = payload(data)
-    known |= dict(colours=colour_maps(), history=history(data.history))
+    content, arrays = payload(data)
+    content |= dict(colours=colour_maps(), history=history(data.history))
     command = template.code('Make it again', data.command) if data.command else ''
-    return template.page(data.title, headline(data.metrics), _scanner(data) + _numbers(data), command, known, arrays)
+    return template.page(data.title, headline(data.metrics), _scanner(data) + _numbers(data), command, content, arrays)
 
 
 def _scanner(data: ReportData) -> str:
@@ -49,7 +49,7 @@ def _scanner(data: ReportData) -> str:
 
 
 def _numbers(data: ReportData) -> str:
-    metrics = {key: value for key, value in data.metrics.items() if is_known(value)}
+    metrics = {key: value for key, value in data.metrics.items() if has_value(value)}
     quality = [(n.label, as_text(key, metrics[key]), n.meaning) for key, n in QUALITY.items() if key in metrics]
     settings = [(n.label, as_text(key, metrics[key]), n.meaning) for key, n in SETTINGS.items() if key in metrics]
     size = ' x '.join(str(n) for n in data.shape or ())

@@ -32,12 +32,12 @@ def payload(data: ReportData, surfaces: bool = True, earlier: Arrays | None = No
         The arrays of an earlier state of the same page; those that are the same still are taken from there.
     """
     arrays = Arrays(earlier)
-    known: dict[str, Any] = {}
+    content: dict[str, Any] = {}
     if data.volume is not None:
         volumes = {'Reconstruction': data.volume}
         if data.truth is not None:
             volumes['Truth'] = data.truth
-        known['slices'] = slice_payload(
+        content['slices'] = slice_payload(
             volumes,
             data.spacing,
             data.centre,
@@ -47,22 +47,22 @@ def payload(data: ReportData, surfaces: bool = True, earlier: Arrays | None = No
             quantity=data.quantity,
         )
         if data.error_map is not None:
-            known['slices'] |= error_maps({'Error map': data.error_map}, known['slices'], arrays)
+            content['slices'] |= error_maps({'Error map': data.error_map}, content['slices'], arrays)
     if data.views is not None:
         images = {'Rendered': data.views}
         reference = None
         if data.views_truth is not None:
             reference = data.reference
             images[reference] = data.views_truth
-        known['views'] = view_payload(images, data.views_angles, data.pixel, arrays, reference)
+        content['views'] = view_payload(images, data.views_angles, data.pixel, arrays, reference)
         if data.views_truth is not None and data.views_angles is not None:
-            known['views']['psnr'] = _psnr_by_view(data.views, data.views_truth, data.views_angles)
+            content['views']['psnr'] = _psnr_by_view(data.views, data.views_truth, data.views_angles)
         if (residuals := data.metrics.get('residual_by_view')) and data.views_angles is not None:
             order = np.argsort(data.views_angles, kind='stable')
             rms = [residuals[i] for i in order]
-            known['views']['residual'] = dict(angles=data.views_angles[order].tolist(), rms=rms)
-    known['space'] = _space(data, arrays, surfaces)
-    return known, arrays
+            content['views']['residual'] = dict(angles=data.views_angles[order].tolist(), rms=rms)
+    content['space'] = _space(data, arrays, surfaces)
+    return content, arrays
 
 
 def _psnr_by_view(views: np.ndarray, truth: np.ndarray, angles: np.ndarray) -> list[float | None]:
@@ -103,9 +103,9 @@ def slice_payload(
 
     factor, small = _add('volume', candidates(), arrays, budget)
     shown = next(iter(small.values()))
-    given = next(iter(volumes.values())).shape
-    old, already = of or (given, 1)
-    by = [min(already, n) * min(factor, m) for n, m in zip(old, given)]
+    full_shape = next(iter(volumes.values())).shape
+    old, already = of or (full_shape, 1)
+    by = [min(already, n) * min(factor, m) for n, m in zip(old, full_shape)]
     step = [float(s * b) for s, b in zip(spacing, by)]
     # Blocks begin at the first voxel; voxels left over at the far end are not shown.
     middle = [float(c + (n * b - m) * s / 2) for c, n, b, m, s in zip(centre, shown.shape, by, old, spacing)]
@@ -126,16 +126,16 @@ def slice_payload(
     )
 
 
-def error_maps(maps: dict[str, np.ndarray], known: dict, arrays: Arrays) -> dict:
+def error_maps(maps: dict[str, np.ndarray], slices: dict, arrays: Arrays) -> dict:
     """Maps of errors [x, y, z], not negative, on the grid of the volumes, by name; each with its own scale.
 
     Parameters
     ----------
-    known : dict
+    slices : dict
         Of these volumes, as `slices` gives it.
     """
     for i, values in enumerate(maps.values()):
-        small = block_means(np.asarray(values, np.float32), known['preview'])
+        small = block_means(np.asarray(values, np.float32), slices['preview'])
         arrays.add(f'map{i}', small, 0.0, float(small.max()), MAP_BITS)
     return dict(maps=[dict(name=name, array=f'map{i}') for i, name in enumerate(maps)])
 
@@ -198,13 +198,13 @@ def _add(name: str, candidates: Iterable[tuple[Any, dict[str, np.ndarray]]], arr
         That candidate.
     """
     for candidate in candidates:
-        found = candidate[1]
-        low = min(float(v.min()) for v in found.values())
-        low, high = arrays.scale(f'{name}0', low, max(float(v.max()) for v in found.values()))
-        bits = bits_within(list(found.values()), low, high, budget)
+        packed = candidate[1]
+        low = min(float(v.min()) for v in packed.values())
+        low, high = arrays.scale(f'{name}0', low, max(float(v.max()) for v in packed.values()))
+        bits = bits_within(list(packed.values()), low, high, budget)
         if bits is not None:
             break
-    for i, array in enumerate(found.values()):
+    for i, array in enumerate(packed.values()):
         arrays.add(f'{name}{i}', array, low, high, bits or 8)
     return candidate
 

@@ -19,7 +19,9 @@ SCRIPTS = (
 )  # fmt: skip
 
 
-def page(title: str, headline: str, numbers: str, command: str, known: dict, arrays: Arrays, live: bool = False) -> str:
+def page(
+    title: str, headline: str, numbers: str, command: str, content: dict, arrays: Arrays, live: bool = False
+) -> str:
     """A page that loads nothing and runs no script but its own, whose digest its policy names.
 
     Parameters
@@ -28,12 +30,12 @@ def page(title: str, headline: str, numbers: str, command: str, known: dict, arr
         Plain text.
     numbers, command : str
         Markup of those sections, made by `table` and `code`.
-    known : dict
+    content : dict
         What the scripts know (JSON); arrays: by name.
     live : bool
         Whether it asks the server that sent it for news.
     """
-    known = known | dict(arrays={name: packed.head() for name, packed in arrays.items()})
+    content = content | dict(arrays={name: packed.head() for name, packed in arrays.items()})
     script = _script()
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode('ascii')
     holders = (f'<script type="text/plain" id="array-{name}">{packed.text}</script>' for name, packed in arrays.items())
@@ -45,7 +47,7 @@ def page(title: str, headline: str, numbers: str, command: str, known: dict, arr
         style='\n'.join(map(_file, STYLES)),
         numbers=numbers,
         command=command,
-        known=as_json(known),
+        known=as_json(content),
         arrays='\n'.join(holders),
         script=script,
     )
@@ -65,8 +67,8 @@ def html_table(title: str, rows: list[tuple[str, ...]], kind: str = '', head: tu
         classes = ['value'] * len(cells)
         if kind == 'numbers' and not head:
             classes[-1] = 'meaning'
-        found = ''.join(f'<td class="{c}">{html.escape(cell)}</td>' for c, cell in zip(classes, cells))
-        out.append(f'<tr><th scope="row">{html.escape(name)}</th>{found}</tr>')
+        row_cells = ''.join(f'<td class="{c}">{html.escape(cell)}</td>' for c, cell in zip(classes, cells))
+        out.append(f'<tr><th scope="row">{html.escape(name)}</th>{row_cells}</tr>')
     return ''.join([*out, '</table></div></section>'])
 
 
@@ -101,5 +103,5 @@ def _file(name: str) -> str:
 @cache
 def _script() -> str:
     libraries = '\n'.join(map(_file, LIBRARIES))
-    own = '\n'.join(map(_file, SCRIPTS))
-    return f"{libraries}\n(() => {{\n'use strict';\n{own}\n}})();\n"
+    scripts = '\n'.join(map(_file, SCRIPTS))
+    return f"{libraries}\n(() => {{\n'use strict';\n{scripts}\n}})();\n"

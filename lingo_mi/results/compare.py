@@ -107,7 +107,7 @@ def compare_page(results: Sequence[tuple[str, Fit | VolumeFile]], truth: Volume 
     names = _names([name for name, _ in results])
     named = dict(zip(names, (result for _, result in results)))
     arrays = Arrays()
-    known: dict[str, Any] = dict(colours=colour_maps(), history=[])
+    content: dict[str, Any] = dict(colours=colour_maps(), history=[])
     volumes = {name: volume for name, r in named.items() if (volume := _volume(r)) is not None}
     if truth is not None and volumes:
         volumes['Truth'] = truth
@@ -126,7 +126,7 @@ def compare_page(results: Sequence[tuple[str, Fit | VolumeFile]], truth: Volume 
                 )
         middle = first.affine[:3, :3] @ ((np.array(first.data.shape) - 1) / 2) + first.affine[:3, 3]
         data = {name: volume.data for name, volume in volumes.items()}
-        known['slices'] = slice_payload(
+        content['slices'] = slice_payload(
             data,
             first.spacing,
             middle,
@@ -140,16 +140,18 @@ def compare_page(results: Sequence[tuple[str, Fit | VolumeFile]], truth: Volume 
             if isinstance(r, VolumeFile) and r.error_map is not None and r.error_map.data.shape == first.data.shape
         }
         if maps:
-            known['slices'] |= error_maps(maps, known['slices'], arrays)
+            content['slices'] |= error_maps(maps, content['slices'], arrays)
     fits = {name: r for name, r in named.items() if isinstance(r, Fit)}
     shown = {name: fit.views for name, fit in fits.items() if fit.views is not None}
     angles = [fits[name].view_angles for name in shown]
     alike = len({images.shape for images in shown.values()}) == 1
     if len(shown) > 1 and alike and all(np.allclose(a, angles[0], atol=1e-3) for a in angles):
-        one = next(iter(shown))
-        known['views'] = view_payload(shown, angles[0], fits[one].nominal_geometry.dDetector, arrays, one)
+        first_shown = next(iter(shown))
+        content['views'] = view_payload(
+            shown, angles[0], fits[first_shown].nominal_geometry.dDetector, arrays, first_shown
+        )
     title = brief(title or ' · '.join(names), 120)
-    return template.page(title, f'{len(results)} results side by side', _tables(named), '', known, arrays)
+    return template.page(title, f'{len(results)} results side by side', _tables(named), '', content, arrays)
 
 
 def _volume(result: Fit | VolumeFile) -> Volume | None:
@@ -215,15 +217,15 @@ def _cells(key: str, metrics: list[dict]) -> list[str]:
     numeric = [
         v if isinstance(v, (int, float)) and not isinstance(v, bool) and math.isfinite(v) else None for v in values
     ]
-    known = [v for v in numeric if v is not None]
+    finite = [v for v in numeric if v is not None]
     compared = key in QUALITY and key not in LISTED
-    if not compared or len(known) < 2:
+    if not compared or len(finite) < 2:
         return texts
     first = numeric[0]
     for i, value in enumerate(numeric[1:], 1):
         if first is not None and value is not None and value != first:
             texts[i] += f'  ({value - first:+{QUALITY[key].form.lstrip(",")}})'
-    if key not in ('gaussians', 'ipsd_targets', 'parameters') and len(set(known)) > 1:
-        best = (min if key in LOWER_IS_BETTER else max)(known)
+    if key not in ('gaussians', 'ipsd_targets', 'parameters') and len(set(finite)) > 1:
+        best = (min if key in LOWER_IS_BETTER else max)(finite)
         texts = [f'★ {text}' if value == best else text for text, value in zip(texts, numeric)]
     return texts

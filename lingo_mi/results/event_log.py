@@ -47,12 +47,12 @@ class EventLog:
             self._writer.add_image(name, image, entry['iteration'], dataformats='HW')
         self._pictures = []
 
-    def look(self, fit: Fit) -> None:
+    def snapshot(self, fit: Fit) -> None:
         """See `watch.Watcher`. Slices are the reconstruction, and beside it the truth if there is one."""
         data = fit.data
         if fit.method.makes_volume:
             truth = None if data is None else data.volume
-            shown = [fit.own_volume] if truth is None else [fit.own_volume, truth]
+            shown = [fit.scan_volume] if truth is None else [fit.scan_volume, truth]
             window = grey_range(shown[-1])
             for axis, name in ((2, 'axial'), (1, 'coronal'), (0, 'sagittal')):
                 index = richest(shown[-1], axis)

@@ -99,13 +99,13 @@ class Live:
             self._history += history([entry])
             if len(self._history) > MOST_ENTRIES:  # every second one of the earlier half, but for what was measured
                 half = self._history[: MOST_ENTRIES // 2]
-                kept = [e for i, e in enumerate(half) if i % 2 or 'psnr_2d' in e or 'psnr_3d' in e]
-                self._history[: MOST_ENTRIES // 2] = kept
+                thinned = [e for i, e in enumerate(half) if i % 2 or 'psnr_2d' in e or 'psnr_3d' in e]
+                self._history[: MOST_ENTRIES // 2] = thinned
                 self._thinned += 1
             self._line = ', '.join(parts) + '.'
         self._show_if_due()
 
-    def look(self, fit: Fit) -> None:
+    def snapshot(self, fit: Fit) -> None:
         """See `watch.Watcher`. It is shown as soon as a page is there and `SHARE` allows it, unless a later one comes first."""
         self._waiting = fit
         self._show_if_due()
@@ -162,8 +162,8 @@ class Live:
 
     def page(self) -> str:
         """The page, still without anything to show."""
-        known = dict(colours=colour_maps(), history=[], live=dict(milliseconds=MILLISECONDS))
-        return template.page(self.title, 'a fit that is running', '', '', known, Arrays(), live=True)
+        content = dict(colours=colour_maps(), history=[], live=dict(milliseconds=MILLISECONDS))
+        return template.page(self.title, 'a fit that is running', '', '', content, Arrays(), live=True)
 
     def state(self, seen: int, place: str) -> dict:
         """What a page does not know yet.
@@ -178,14 +178,14 @@ class Live:
         with self._lock:
             self._asked = time.perf_counter()
             number, thinned = self._number, str(self._thinned)
-            cut, _, known = place.partition('.')
-            whole = not (cut == thinned and known.isdecimal() and len(known) < 10)
-            told = dict(
+            cut, _, entries = place.partition('.')
+            whole = not (cut == thinned and entries.isdecimal() and len(entries) < 10)
+            history_part = dict(
                 whole=whole,
-                entries=self._history[0 if whole else int(known) :],
+                entries=self._history[0 if whole else int(entries) :],
                 place=f'{thinned}.{len(self._history)}',
             )
-            out: dict[str, Any] = dict(number=number, line=self._line, done=self._done, history=told)
+            out: dict[str, Any] = dict(number=number, line=self._line, done=self._done, history=history_part)
         return out if number in (0, seen) else out | self._news(seen)
 
     def sent(self, state: dict) -> None:
@@ -203,18 +203,18 @@ class Live:
         with self._packing:
             with self._lock:
                 number, data = self._number, self._data
-            made, known, arrays = self._packed
-            if made != number and data is not None:
+            packed_number, content, arrays = self._packed
+            if packed_number != number and data is not None:
                 began, before = time.thread_time(), arrays
-                known, arrays = payload(data, surfaces=False, earlier=before)
-                known['arrays'] = {name: packed.head() for name, packed in arrays.items()}
+                content, arrays = payload(data, surfaces=False, earlier=before)
+                content['arrays'] = {name: packed.head() for name, packed in arrays.items()}
                 self._changed |= {name: number for name, packed in arrays.items() if before.get(name) is not packed}
-                self._packed = number, known, arrays
+                self._packed = number, content, arrays
                 with self._lock:
                     self._latest += time.thread_time() - began
-            known_to_page = seen if seen <= number else 0
-            new = {name: packed.text for name, packed in arrays.items() if self._changed[name] > known_to_page}
-            return dict(number=number, known=known, texts=new)
+            page_state = seen if seen <= number else 0
+            new = {name: packed.text for name, packed in arrays.items() if self._changed[name] > page_state}
+            return dict(number=number, known=content, texts=new)
 
 
 def _handler(live: Live) -> type[BaseHTTPRequestHandler]:

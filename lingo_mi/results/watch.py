@@ -23,7 +23,7 @@ class Watcher(Protocol):
     def step(self, entry: dict, total: int) -> None:
         """About every second: `iteration`, `seconds`, `loss`, `gaussians`, and at some also what was measured; steps in all."""
 
-    def look(self, fit: Fit) -> None:
+    def snapshot(self, fit: Fit) -> None:
         """At a few moments, each right before the step that has its numbers. The fit knows few of its held-out views."""
 
     def close(self, finished: bool) -> None:
@@ -37,7 +37,7 @@ class Watch:
         """total: steps of the fit."""
         self.watchers, self.total = list(watchers), total
         self._began = time.perf_counter()
-        self._told, self._new = 0.0, {}
+        self._reported, self._new = 0.0, {}
 
     def step(
         self,
@@ -51,19 +51,19 @@ class Watch:
     ) -> None:
         """To be called after every step with what `fitting.loop.run` reports. It returns at once where nothing is to be told."""
         now, total = time.perf_counter() - self._began, stops_at or self.total
-        if not self.watchers or not (self._new or now - self._told >= EVERY or iteration == total):
+        if not self.watchers or not (self._new or now - self._reported >= EVERY or iteration == total):
             return
-        self._told = now
+        self._reported = now
         if held_out is not None:
             return self._each(lambda watcher: watcher.search(iteration, held_out))
         entry = dict(iteration=iteration, seconds=now, loss=loss(), gaussians=gaussians) | self._new
         self._new = {}
         self._each(lambda watcher: watcher.step(entry, total))
 
-    def look(self, fit: Fit, numbers: dict) -> None:
+    def snapshot(self, fit: Fit, numbers: dict) -> None:
         """To be called with a fit that was measured, and what was measured."""
         self._new = dict(numbers)
-        self._each(lambda watcher: watcher.look(fit))
+        self._each(lambda watcher: watcher.snapshot(fit))
 
     def close(self, finished: bool) -> None:
         """To be called at the end."""

@@ -20,9 +20,9 @@ def watchers_of(geometry: Geometry, live: bool, log_dir: str | PathLike | None, 
         If the log cannot be written, or its library is missing.
     """
     require_type('live', live, bool)
-    found: list[Watcher] = [] if log_dir is None else [EventLog(log_dir)]
+    watchers: list[Watcher] = [] if log_dir is None else [EventLog(log_dir)]
     if live:
         page = Live(geometry, title)
         page.announce()
-        found.append(page)
-    return found
+        watchers.append(page)
+    return watchers

@@ -22,11 +22,11 @@ def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0
     needed : float
         Peak memory of an algorithm, bytes (0: the least, see `least_memory`).
     """
-    known = [g for g in geometries if g is not None]
-    views = views or sum(map(len, known))
-    needed = needed or least_memory(known[0], views)
+    present = [g for g in geometries if g is not None]
+    views = views or sum(map(len, present))
+    needed = needed or least_memory(present[0], views)
     if needed > (has := room()):
-        size = [' x '.join(map(str, counts)) for counts in (known[0].grid.shape, known[0].nDetector)]
+        size = [' x '.join(map(str, counts)) for counts in (present[0].grid.shape, present[0].nDetector)]
         raise InputError(
             f'{size[0]} voxels and {views} views of {size[1]} pixels need at least {needed / 2**30:,.1f} GiB of '
             f'memory, but this process may take {has / 2**30:,.1f} GiB: lower nVoxel, nDetector or the views'

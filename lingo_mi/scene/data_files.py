@@ -25,16 +25,16 @@ def data_file(name: str, parameter: str) -> str:
         In one line, if there is no such file, or if it is a device or a pipe, which may have no end.
     """
     resolver: Any = mi.file_resolver  # declared as an object
-    found = Path(str(resolver().resolve(name)))
+    path = Path(str(resolver().resolve(name)))
     folder = os.environ.get('LINGO_MI_DATA')
-    if not os.path.exists(found) and folder:  # other than Path's, False for a name that is too long
-        found = Path(folder) / name
-    if not os.path.exists(found):
+    if not os.path.exists(path) and folder:  # other than Path's, False for a name that is too long
+        path = Path(folder) / name
+    if not os.path.exists(path):
         where = f'nor in LINGO_MI_DATA = {folder}' if folder else 'and LINGO_MI_DATA is not set'
         raise InputError(
             f'{name[:100]}: there is no such file beside the scene, {where}; set LINGO_MI_DATA to the folder '
             f'that holds it, or name your file: {parameter}=FILE'
         )
-    if not found.is_file() and not found.is_dir():
+    if not path.is_file() and not path.is_dir():
         raise InputError(f'{name}: is not a regular file, but a device or a pipe; name another: {parameter}=FILE')
-    return str(found)
+    return str(path)

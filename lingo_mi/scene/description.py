@@ -118,7 +118,7 @@ def _counts(props, name):
     return values
 
 
-def own_grid(props: Any, grid: Grid) -> Grid:
+def grid_from(props: Any, grid: Grid) -> Grid:
     """The voxels that a plugin's properties name, and what they do not name of `grid`."""
     values: dict[str, Any] = dict(nVoxel=grid.shape, dVoxel=grid.spacing, offOrigin=grid.centre)
     if 'nVoxel' in props:
@@ -190,11 +190,11 @@ def _split_numbers(text: str) -> tuple[list[float], list[str]]:
 
 def _read_poses(props, shared):
     """A scan with a pose for every view."""
-    given = [name for name in _CIRCLE if name in props]
-    if given:
-        raise InputError(f'{given[0]} and poses both say which views there are; leave one of them out')
-    known = {k: v for k, v in shared.items() if k != 'mode'}
-    known |= {'dDetector': _numbers(props, 'dDetector')} if 'dDetector' in props else {}
+    circular_names = [name for name in _CIRCLE if name in props]
+    if circular_names:
+        raise InputError(f'{circular_names[0]} and poses both say which views there are; leave one of them out')
+    values = {k: v for k, v in shared.items() if k != 'mode'}
+    values |= {'dDetector': _numbers(props, 'dDetector')} if 'dDetector' in props else {}
 
     def views(n_detector, step, parallel, origin):
         poses = props['poses']
@@ -207,4 +207,4 @@ def _read_poses(props, shared):
             raise InputError(f'poses must be 12 numbers for every view, not {len(numbers)}')
         return astra.from_vectors(np.reshape(numbers, (-1, 12)), n_detector, parallel)
 
-    return to_posed(known | {'mode': shared['mode']}, views, 'poses')
+    return to_posed(values | {'mode': shared['mode']}, views, 'poses')

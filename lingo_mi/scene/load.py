@@ -46,12 +46,12 @@ def load_scene(path: PathLike | str, parameters: dict | None = None, slab: int =
         In one line, for whatever mitsuba or a plugin finds wrong, and where memory does not suffice.
     """
     path = Path(path)
-    known = outline(path, parameters)
-    unknown = set(parameters or {}) - known
+    accepted = outline(path, parameters)
+    unknown = set(parameters or {}) - accepted
     if unknown:
         raise InputError(
             f'{path}: the scene has no parameter {", ".join(sorted(unknown))}; '
-            f'it has {", ".join(sorted(known)) or "none"}'
+            f'it has {", ".join(sorted(accepted)) or "none"}'
         )
     scene = load_file(path, parameters)
     if not isinstance(scene, mi.Scene):

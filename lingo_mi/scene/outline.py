@@ -31,11 +31,13 @@ def scene_files(path: PathLike | str, parameters: dict | None = None) -> list[Pa
     InputError
         As `outline`.
     """
-    look = _Look({name: str(value) for name, value in (parameters or {}).items()})
-    look.at(Path(path), 0)
+    reader = _Reader({name: str(value) for name, value in (parameters or {}).items()})
+    reader.at(Path(path), 0)
     if folder := os.environ.get('LINGO_MI_DATA'):
-        look.folders.append(Path(folder))
-    return sorted(look.scenes | {file for text in look.texts for file in look.places(text) if os.path.isfile(file)})
+        reader.folders.append(Path(folder))
+    return sorted(
+        reader.scenes | {file for text in reader.texts for file in reader.places(text) if os.path.isfile(file)}
+    )
 
 
 def outline(path: PathLike | str, parameters: dict | None = None) -> set[str]:
@@ -53,13 +55,13 @@ def outline(path: PathLike | str, parameters: dict | None = None) -> set[str]:
         memory holds, or is larger or deeper than any scene; and so for the files that it includes. Likewise if a shape's or a
         texture's file is a device or a pipe, which has no end.
     """
-    look = _Look({name: str(value) for name, value in (parameters or {}).items()})
-    look.at(Path(path), 0)
-    return look.defaults
+    reader = _Reader({name: str(value) for name, value in (parameters or {}).items()})
+    reader.at(Path(path), 0)
+    return reader.defaults
 
 
 @dataclass
-class _Look:
+class _Reader:
     """What is known after a part of the files.
 
     Parameters
@@ -84,7 +86,7 @@ class _Look:
     elements: int = 0
 
     def at(self, path: Path, included: int):
-        """Look at a file that is `included` files deep."""
+        """Read a file that is `included` files deep."""
         if included > MOST_INCLUDES:
             raise InputError(f'{path}: is included more than {MOST_INCLUDES} files deep')
         _require_scene(path)
@@ -92,7 +94,7 @@ class _Look:
         self.folders.append(path.parent)
         more, depth = [], 0
 
-        def begin(tag, given):
+        def begin(tag, attributes):
             nonlocal depth
             depth, self.elements = depth + 1, self.elements + 1
             if depth > MOST_DEPTH or self.elements > MOST_ELEMENTS:
@@ -101,16 +103,16 @@ class _Look:
                     f'{MOST_DEPTH} of them within each other'
                 )
             if tag == 'default':
-                self.values.setdefault(given.get('name', ''), given.get('value', ''))
+                self.values.setdefault(attributes.get('name', ''), attributes.get('value', ''))
                 if not included:
-                    self.defaults.add(given.get('name', ''))
+                    self.defaults.add(attributes.get('name', ''))
             elif tag == 'path':
-                self.folders += [folder / self.filled(given.get('value', '')) for folder in self.folders]
+                self.folders += [folder / self.filled(attributes.get('value', '')) for folder in self.folders]
             elif tag == 'include':
-                more.append(self.filled(given.get('filename', '')))
+                more.append(self.filled(attributes.get('filename', '')))
             elif tag == 'string':
-                self.texts.add(text := self.filled(given.get('value', '')))
-                if given.get('name') == 'filename':
+                self.texts.add(text := self.filled(attributes.get('value', '')))
+                if attributes.get('name') == 'filename':
                     self.require_readable(path, text)
 
         def end(tag):
@@ -130,8 +132,8 @@ class _Look:
         except OSError as error:
             raise InputError(f'{path}: cannot be read ({error.strerror}); check its permissions') from None
         for name in more:
-            for found in self.places(name):
-                self.at(found, included + 1)
+            for file in self.places(name):
+                self.at(file, included + 1)
 
     def filled(self, text: str) -> str:
         """A value with the parameters in it replaced, longer names first."""

@@ -30,12 +30,12 @@ def scene_path(scene: PathLike | str) -> Path:
     path = Path(scene)
     if os.path.isfile(path):  # other than Path's, False for a name that is too long
         return path
-    known = scenes()
-    if str(scene) in known:
-        return known[str(scene)]
+    shipped = scenes()
+    if str(scene) in shipped:
+        return shipped[str(scene)]
     if os.path.exists(path):
         return path
     name = str(scene)[:100]
     raise InputError(
-        f'{name}: there is no such scene{nearest(name, known)}; name a file, or one of {", ".join(sorted(known))}'
+        f'{name}: there is no such scene{nearest(name, shipped)}; name a file, or one of {", ".join(sorted(shipped))}'
     )

@@ -114,21 +114,21 @@ def render_objects(objects: Sequence, geometry: Geometry, extent: float = cutoff
     """Line integrals of all objects in all views, float32 [view, v, u]; Gaussians end at `extent` standard deviations."""
     total = np.zeros((len(geometry), *geometry.nDetector), np.float32)
     with Progress('Scan', len(geometry) * len(objects)) as bar:
-        for k, thing in enumerate(objects):
+        for k, obj in enumerate(objects):
 
             def report(done, _):
                 bar.update(k * len(geometry) + done)
 
-            same_box = isinstance(thing, GridInCube) and fills_grid(thing, geometry.grid)
-            if isinstance(thing, ScannedVolume):
-                total += thing.project(geometry, report)
+            same_box = isinstance(obj, GridInCube) and fills_grid(obj, geometry.grid)
+            if isinstance(obj, ScannedVolume):
+                total += obj.project(geometry, report)
             elif same_box:  # skips empty margins, which rendering through the scene may not
-                total += grid.project_volume(grid_values(thing), geometry, report)
+                total += grid.project_volume(grid_values(obj), geometry, report)
             else:
                 rays = geometry.rays(curved=True)
                 for i in range(len(geometry)):
                     view = View.of(rays, i, *geometry.nDetector)
-                    total[i] += thing.line_integrals(view, RenderOptions(extent)).numpy().reshape(geometry.nDetector)
+                    total[i] += obj.line_integrals(view, RenderOptions(extent)).numpy().reshape(geometry.nDetector)
                     report(i + 1, None)
     return total
 
@@ -142,14 +142,14 @@ def render_with(
     extent: float = cutoff.SIMULATE,
 ) -> np.ndarray:
     """`render_objects` as measured by a detector. keys: keys of the views' noise."""
-    objects = [thing.in_box() if isinstance(thing, ScannedVolume) else thing for thing in objects]
+    objects = [obj.in_box() if isinstance(obj, ScannedVolume) else obj for obj in objects]
     out = np.empty((len(geometry), *geometry.nDetector), np.float32)
     rays = geometry.rays(curved=True)
     with Progress('Scan', len(geometry)) as bar:
         for i in range(len(geometry)):
             view = View.of(rays, i, *geometry.nDetector)
-            one = replace(effects, index=int(keys[i]))
-            expected = one.line_integrals(objects, view, RenderOptions(extent))
-            out[i] = one.measured(expected, view, seed).numpy().reshape(out.shape[1:])
+            keyed = replace(effects, index=int(keys[i]))
+            expected = keyed.line_integrals(objects, view, RenderOptions(extent))
+            out[i] = keyed.measured(expected, view, seed).numpy().reshape(out.shape[1:])
             bar.update(i + 1)
     return out

@@ -15,25 +15,25 @@ from lingo_mi.projectors.sampling import on_grid
 def true_volume(objects: Iterable, grid: Grid) -> np.ndarray | None:
     """The true density on the scanner's grid [x, y, z]; None if an object cannot be sampled on it."""
     total = np.zeros(grid.shape, np.float32)
-    for thing in objects:
-        if isinstance(thing, ScannedVolume):
-            total += thing.data
-        elif isinstance(thing, Instance):
+    for obj in objects:
+        if isinstance(obj, ScannedVolume):
+            total += obj.data
+        elif isinstance(obj, Instance):
             return None
-        elif not isinstance(thing, GridInCube) or fills_grid(thing, grid):
-            total += on_grid(thing, grid.low, grid.spacing, grid.shape)
+        elif not isinstance(obj, GridInCube) or fills_grid(obj, grid):
+            total += on_grid(obj, grid.low, grid.spacing, grid.shape)
         else:
             return None
     return total
 
 
-def fills_grid(thing: GridInCube, grid: Grid) -> bool:
+def fills_grid(obj: GridInCube, grid: Grid) -> bool:
     """Whether an object's grid is the scanner's own."""
     near = 1e-4 * max(grid.size) / 2
     return (
-        tuple(thing.size) == grid.shape
-        and np.allclose(thing.low, grid.low, atol=near)
-        and np.allclose(thing.high, grid.high, atol=near)
+        tuple(obj.size) == grid.shape
+        and np.allclose(obj.low, grid.low, atol=near)
+        and np.allclose(obj.high, grid.high, atol=near)
     )
 
 

@@ -101,10 +101,10 @@ def read_object(path: PathLike | str) -> dict[str, Any]:
     InputError
         If it cannot be read or holds something else.
     """
-    found = read_json(path)
-    if not isinstance(found, dict):
+    content = read_json(path)
+    if not isinstance(content, dict):
         raise InputError(f'{path}: is damaged; remove it, to make it again')
-    return found
+    return content
 
 
 @contextmanager
@@ -209,9 +209,9 @@ def leftovers(folder: Path, folders: bool = False) -> list[tuple[Path, str]]:
     folders : bool
         Its folders instead.
     """
-    found = [(path, _LEFTOVER.fullmatch(path.name)) for path in folder.iterdir()]
+    matches = [(path, _LEFTOVER.fullmatch(path.name)) for path in folder.iterdir()]
     kind = Path.is_dir if folders else Path.is_file
-    return [(path, match[1]) for path, match in found if match and kind(path) and not path.is_symlink()]
+    return [(path, match[1]) for path, match in matches if match and kind(path) and not path.is_symlink()]
 
 
 def write_text(path: PathLike | str, text: str) -> None:
@@ -280,19 +280,19 @@ def writing(path: PathLike | str) -> Iterator[None]:
         ) from None
 
 
-def require_writable(folder: Path, path: Path, mend: str = 'choose another place') -> None:
+def require_writable(folder: Path, path: Path, remedy: str = 'choose another place') -> None:
     """Raises InputError, in the name of `path`, unless `folder` can be made and written to. Leaves nothing behind.
 
     Parameters
     ----------
-    mend : str
+    remedy : str
         What to do, for the message.
     """
     try:
         with tempfile.TemporaryFile(dir=_deepest(folder)):  # of a name that no file has
             pass
     except OSError as error:
-        raise InputError(f'{path}: cannot write there ({error.strerror}); {mend}') from None
+        raise InputError(f'{path}: cannot write there ({error.strerror}); {remedy}') from None
 
 
 def _deepest(folder: Path) -> Path:

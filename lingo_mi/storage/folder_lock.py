@@ -72,12 +72,12 @@ def writing_file(path: Path) -> Iterator[None]:
 def _take(path: Path, stack: ExitStack) -> None:
     """Take the lock; the stack gives it back."""
     while True:
-        file, made = _open(path)
+        file, created = _open(path)
         with ExitStack() as failed:
             failed.callback(os.close, file)
             held = _hold(file)
             owner = _owner(file)
-            if held is False or held is None and not made and _alive(owner):
+            if held is False or held is None and not created and _alive(owner):
                 raise _refusal(path, owner, held is None)
             if not _same(path, file):
                 continue  # its owner has removed it meanwhile
@@ -133,8 +133,8 @@ def _owner(file: int) -> dict:
     if not content:  # just made, or its owner was killed then
         return {}
     try:
-        found = json.loads(content)
-        return dict(pid=int(found['pid']), host=str(found['host']))
+        owner = json.loads(content)
+        return dict(pid=int(owner['pid']), host=str(owner['host']))
     except (KeyError, TypeError, ValueError):
         raise InputError(
             f'a file {LOCK} holds {shown(content[:20])}, so it is not a lock of lingo_mi; move it away'
@@ -154,10 +154,10 @@ def _alive(owner: dict) -> bool:
 def _refusal(path: Path, owner: dict, lasting: bool) -> InputError:
     """The error; lasting: the lock stays when its owner is killed."""
     who = f'process {owner["pid"]} on {shown(owner["host"])}' if owner else 'another process'
-    mend = 'wait for it, or choose another place'
+    remedy = 'wait for it, or choose another place'
     if lasting:
-        mend += f'; if it has ended, remove {path.name}'
-    return InputError(f'{path.parent}: {who} is writing there; {mend}')
+        remedy += f'; if it has ended, remove {path.name}'
+    return InputError(f'{path.parent}: {who} is writing there; {remedy}')
 
 
 def _give_back(path: Path, file: int) -> None:

@@ -58,8 +58,8 @@ def manifest_of(folder: Path) -> Manifest:
     if not os.path.lexists(path):
         return Manifest()
     _require_file(path)
-    found = read_json(path)
-    names, begun = (found.get('files'), found.get('writing')) if isinstance(found, dict) else (None, None)
+    content = read_json(path)
+    names, begun = (content.get('files'), content.get('writing')) if isinstance(content, dict) else (None, None)
     if not (isinstance(names, list) and isinstance(begun, bool) and all(isinstance(n, str) for n in names)):
         raise InputError(f'{path}: is not a manifest of lingo_mi; move it away, or choose another folder')
     return Manifest(frozenset(n for n in names if _is_name(n)), begun)
@@ -132,11 +132,11 @@ def complete_result(folder: Path, names: Iterable[str], numbers: dict, default: 
 
 def digest(path: Path) -> str:
     """A digest of a file's content."""
-    found = hashlib.blake2b(digest_size=32)
+    hasher = hashlib.blake2b(digest_size=32)
     with reading(path), open(path, 'rb') as file:
         while part := file.read(1 << 20):
-            found.update(part)
-    return f'blake2b:{found.hexdigest()}'
+            hasher.update(part)
+    return f'blake2b:{hasher.hexdigest()}'
 
 
 def require_together(folder: Path, names: Iterable[str]) -> None:
@@ -152,12 +152,12 @@ def require_together(folder: Path, names: Iterable[str]) -> None:
             raise InputError(f'{folder}: a result was not completed here; resume the fit, or fit again')
         return
     record = read_json(path)
-    known = record.get('files') if isinstance(record, dict) else None
-    if not isinstance(known, dict):
+    digests = record.get('files') if isinstance(record, dict) else None
+    if not isinstance(digests, dict):
         return
     for name in names:
         file = folder / name
-        if name in known and file.exists() and digest(file) != known[name]:
+        if name in digests and file.exists() and digest(file) != digests[name]:
             raise InputError(f'{file}: does not match {METRICS} beside it; fit again')
 
 
@@ -209,11 +209,11 @@ def clear_leftovers(folder: Path) -> None:
 
 def _leftovers(folder: Path) -> list[Path]:
     """Files of a result that never got their names."""
-    found = [path for path, target in leftovers(folder) if target == MANIFEST or _is_name(target)]
+    files = [path for path, target in leftovers(folder) if target == MANIFEST or _is_name(target)]
     views = folder / VIEWS
     if views.is_dir() and not views.is_symlink():
-        found += [path for path, target in leftovers(views) if _is_name(f'{VIEWS}/{target}')]
-    return found
+        files += [path for path, target in leftovers(views) if _is_name(f'{VIEWS}/{target}')]
+    return files
 
 
 def _is_name(name: str) -> bool:

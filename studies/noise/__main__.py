@@ -16,7 +16,7 @@ from lingo_mi.cli.common import Parser
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.runtime import use_variant
 from lingo_mi.storage.file_access import require_writable
-from studies.command import renewed_table, run_study
+from studies.command import run_study, updated_table
 
 
 def arguments() -> argparse.Namespace:
@@ -62,7 +62,7 @@ def main() -> None:
     require_writable(args.out, args.out, 'choose another --out')
     study = Study(args.out, args.size, args.pixels, args.iterations or Fast.iterations)
     cases = [Case(n, p, f, args.views) for f in args.finer for n in names for p in args.photons]
-    with renewed_table(args.out / 'noise.md', lambda: study.table(cases)) as renew:
+    with updated_table(args.out / 'noise.md', lambda: study.table(cases)) as renew:
         study.compute_missing(cases, settings, renew)
 
 

@@ -25,7 +25,7 @@ from lingo_mi.reconstruction.line_integrals import line_integrals
 from lingo_mi.scene.load import load_scene
 from lingo_mi.scene.shipped import scene_path
 from lingo_mi.storage.file_access import require_writable
-from studies.command import renewed_table, run_study
+from studies.command import run_study, updated_table
 
 
 def arguments() -> argparse.Namespace:
@@ -61,7 +61,7 @@ def main() -> None:
     folder = args.out / '_'.join([Path(args.projections or scene).stem, *map(str, geometry.grid.shape)])
     require_writable(folder, folder, 'choose another --out')
     study = Study(dataset, folder)
-    with renewed_table(folder / 'peers.md', lambda: study.table(methods, args.counts)) as renew:
+    with updated_table(folder / 'peers.md', lambda: study.table(methods, args.counts)) as renew:
         study.compute_missing(methods, args.counts, renew)
     study.draw(methods, args.counts, folder / 'slices.png')
     print(folder / 'slices.png')

@@ -18,7 +18,7 @@ from lingo_mi.cli.common import Parser
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.runtime import use_variant
 from lingo_mi.storage.file_access import require_writable
-from studies.command import renewed_table, run_study
+from studies.command import run_study, updated_table
 
 
 def arguments() -> argparse.Namespace:
@@ -61,7 +61,7 @@ def main() -> None:
     ]
     for case in cases:
         study.check(case)
-    with renewed_table(args.out / 'regret.md', lambda: study.table(cases)) as renew:
+    with updated_table(args.out / 'regret.md', lambda: study.table(cases)) as renew:
         study.compute_missing(cases, args.clouds, renew)
 
 

@@ -11,7 +11,7 @@ from lingo_mi.calibration.cross_prediction import coarse
 from lingo_mi.calibration.drift import Drift, scan_times
 from lingo_mi.calibration.panel import Panel
 from lingo_mi.calibration.response.response import Response
-from lingo_mi.calibration.search import Found
+from lingo_mi.calibration.search import SearchResult
 from lingo_mi.effects.detector import Detector
 from lingo_mi.effects.forward import Effects
 from lingo_mi.geometry import circular
@@ -331,7 +331,7 @@ def test_a_response_that_was_not_found_leaves_the_effects():
     scan = lm.Scan(geometry, grid.project_volume(data, geometry), effects=effects)
     response = Response.of(geometry, air='smooth')
     drift = Drift(geometry, u=(0.5,), v=(0.3,))
-    found = Found(drift, response, dict(u=0.5, v=0.3), dict(u=0.01, v=0.01), {}, 1.0, 0.5)
+    found = SearchResult(drift, response, dict(u=0.5, v=0.3), dict(u=0.01, v=0.01), {}, 1.0, 0.5)
     calibration = Calibration(geometry, found)
     moved = calibration.corrected(scan)
     assert moved.effects is effects and moved.geometry != geometry

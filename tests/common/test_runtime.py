@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from lingo_mi.common import runtime
-from lingo_mi.common.runtime import calm_openmp, find_libllvm, mend_llvm, use_threads, warn_of_spinning
+from lingo_mi.common.runtime import calm_openmp, find_libllvm, restart_llvm, use_threads, warn_of_spinning
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def test_an_old_llvm_that_cannot_be_exchanged(monkeypatch, tmp_path):
     monkeypatch.setattr(dr.detail, 'llvm_version', lambda: (14, 0, 0))
     monkeypatch.setattr(dr, '__file__', str(tmp_path / '__init__.py'))
     with pytest.warns(UserWarning, match='runs on LLVM 14, .* or set DRJIT_LIBLLVM_PATH'):
-        mend_llvm()
+        restart_llvm()
 
 
 @pytest.mark.thorough

@@ -369,7 +369,7 @@ def test_materials_of_shapes_in_a_cloud():
         for one, other in (('Al', 'water'), ('water', 'Al'))
     ]
     for tube in tubes:
-        assert tube.fitted() == tube.of_cloud().made_of('cloud') == ('water', 'Al')
+        assert tube.fitted() == tube.of_cloud().materials_of('cloud') == ('water', 'Al')
 
 
 @physics

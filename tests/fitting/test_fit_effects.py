@@ -365,4 +365,4 @@ def test_a_cloud_stands_for_all_shapes():
     scan = replace(tiny_scan(geometry(8)), effects=Effects(made))
     scan = replace(scan, projections=scan.projections / 20)
     fitted = run(scan, SHORT.changed(iterations=4, densify_from=100), seed=3)
-    assert fitted.model.effects.of_cloud().tube.made_of('cloud') == ('water', 'Al')
+    assert fitted.model.effects.of_cloud().tube.materials_of('cloud') == ('water', 'Al')

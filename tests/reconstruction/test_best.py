@@ -211,7 +211,7 @@ def test_values_predict_views_and_means_the_truth(finer_scan):
     assert found['finer'].grid == scan.geometry.grid.finer(2) and found['finer'].error.shape == (48, 48, 48)
     assert wrong['finer'] < wrong['values'] < min(wrong['means'], missed(pocs, scan.geometry.grid))
     assert psnr_3d(found['means'].volume, truth) > psnr_3d(found['values'].volume, truth)
-    assert all(trial.given is not None for trial in found['values'].plan)
+    assert all(trial.output_score is not None for trial in found['values'].plan)
     np.testing.assert_allclose(means(found['finer'].volume, 2), found['means'].volume, rtol=1e-5, atol=1e-7)
 
 

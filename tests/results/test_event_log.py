@@ -68,9 +68,9 @@ def test_pictures_have_the_step_of_their_numbers(tmp_path):
     from types import SimpleNamespace
 
     log, fit = EventLog(tmp_path), SimpleNamespace(method=lm.R2(), data=None, views=None)
-    fit.own_volume = np.ones((4, 4, 4), np.float32)
+    fit.scan_volume = np.ones((4, 4, 4), np.float32)
     for step in 7, 5000:
-        log.look(fit)
+        log.snapshot(fit)
         log.step(dict(iteration=step, loss=1.0), 5000)
     log.close(True)
     steps = {event.step for event in records(tmp_path) for value in event.summary.value if value.HasField('image')}

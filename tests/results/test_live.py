@@ -116,7 +116,7 @@ class Failing:
     def step(self, entry, total):
         self._fail('step')
 
-    def look(self, fit):
+    def snapshot(self, fit):
         self._fail('look')
 
     def close(self, finished):
@@ -247,7 +247,7 @@ def test_a_page_is_told_what_it_does_not_know(live, data):
     """New entries of the history; of the arrays those that have changed, so the truth once."""
     asked(live)
     live.step(entry(1), 100)
-    live.look(Drawn(data))
+    live.snapshot(Drawn(data))
     live.step(entry(2, psnr_2d=float('nan'), psnr_3d=None), 100)
     first = asked(live)
     assert [e['iteration'] for e in first['history']['entries']] == [1, 2] and first['history']['whole']
@@ -290,14 +290,14 @@ def test_looking_takes_its_share_and_no_more(live, data, monkeypatch):
     monkeypatch.setattr('lingo_mi.results.live.time.process_time', lambda: clock.now)
     contents = live._contents
     monkeypatch.setattr(live, '_contents', lambda seen: (setattr(clock, 'now', clock.now + 3.0), contents(seen))[1])
-    live.look(Drawn(data))
+    live.snapshot(Drawn(data))
     assert live._number == 0
     asked(live)
     live.step(entry(1), 10_000)  # not a new look: the one before, for the page that has come since
     assert live._number == 1
     for _ in range(1000):
         clock.now += 1.0
-        live.look(Drawn(data))
+        live.snapshot(Drawn(data))
     assert 3.0 * live._number <= SHARE * (clock.now - live._began) < 3.0 * (live._number + 2)
 
 

@@ -132,12 +132,12 @@ class Response:
     def names(self) -> dict[str, float]:
         """What numbers are called in `changed`, with steps for differences: 'air0', of the constant, 'air1', of the first
         polynomial in time, 'curve0_1', of the second coefficient. Those that `hold` takes out are left out."""
-        found = {}
+        steps = {}
         for part in self.parts:
             for row in range(part.varies != 'one' and part.name == 'gain', len(part.values)):
                 for k, deviation in enumerate(part.deviations):
-                    found[f'{part.name}{row}' + (f'_{k}' if len(part.deviations) > 1 else '')] = 0.1 * deviation
-        return found
+                    steps[f'{part.name}{row}' + (f'_{k}' if len(part.deviations) > 1 else '')] = 0.1 * deviation
+        return steps
 
     def changed(self, numbers: dict[str, float]) -> Response:
         """A copy with other numbers, by name. Those that are missing are 0, and names of no part are passed over."""
@@ -149,18 +149,18 @@ class Response:
 
     def doubts(self, numbers: dict[str, float], errors: dict[str, float]) -> dict[str, str]:
         """Which numbers, by name, cannot be true, given their standard errors, and why."""
-        found = {}
+        reasons = {}
         for part in self.changed(numbers).parts:
             if why := part.doubt(_values(part, errors)):
-                found |= {name: why for name in self.names() if name.rstrip('0123456789_') == part.name}
-        return found
+                reasons |= {name: why for name in self.names() if name.rstrip('0123456789_') == part.name}
+        return reasons
 
     def report(self) -> dict[str, list[float]]:
         """What was found, in physical units, of every view (of a curve: once)."""
-        found = {}
+        values = {}
         for part, matrix in zip(self.parts, self._matrices(self.geometry)):
-            found |= part.report(part.values if part.varies == 'one' else matrix @ part.values)
-        return found
+            values |= part.report(part.values if part.varies == 'one' else matrix @ part.values)
+        return values
 
     def _step(self, p, m, inside, place, matrices):
         widths = [part.values.size for part in self.parts]
@@ -172,7 +172,7 @@ class Response:
             x, columns = p[i], []
             for part, c in zip(self.parts, numbers):
                 by_numbers, by_p = part.slopes(x, c, place)
-                columns = [[by_p * a for a in found] for found in columns] + [by_numbers]
+                columns = [[by_p * a for a in slopes] for slopes in columns] + [by_numbers]
                 x = part.apply(x, c, place)
             r = m[i] - x
             use = inside[i]
@@ -182,15 +182,15 @@ class Response:
                 deviation = max(1.4826 * float(np.median(np.abs(r[use]))), 1e-6)
             weight = use * np.minimum(1, ROBUST * deviation / np.maximum(np.abs(r), 1e-12))
             # The view's own derivatives, then by what its numbers are made of.
-            own = np.array([a.ravel() for found in columns for a in found])
-            to = np.zeros((len(own), starts[-1]))
+            by_view = np.array([a.ravel() for slopes in columns for a in slopes])
+            to = np.zeros((len(by_view), starts[-1]))
             k = 0
             for part, matrix, start, width in zip(self.parts, matrices, starts, widths):
                 count = len(part.deviations)
                 to[k : k + count, start : start + width] = np.kron(matrix[i][None], np.eye(count)).reshape(count, width)
                 k += count
-            weighted = own * weight.ravel()
-            H += to.T @ (weighted @ own.T) @ to
+            weighted = by_view * weight.ravel()
+            H += to.T @ (weighted @ by_view.T) @ to
             g += to.T @ (weighted @ r.ravel())
         if deviation is None:
             return
@@ -212,8 +212,8 @@ class Response:
         return out
 
     def _matrices(self, geometry):
-        own = len(geometry) == len(self.geometry) and np.array_equal(geometry.angles, self.geometry.angles)
-        if own:
+        same_views = len(geometry) == len(self.geometry) and np.array_equal(geometry.angles, self.geometry.angles)
+        if same_views:
             return self._in_time(np.linspace(-1, 1, len(geometry)), np.arange(len(geometry)))
         t = scan_times(self.geometry, geometry.angles)
         return self._in_time(t, np.clip((t + 1) / 2, 0, 1) * (len(self.geometry) - 1))
@@ -221,15 +221,15 @@ class Response:
     def _in_time(self, t, index):
         """For each part the matrix [view, T] that makes a view's numbers of `values`; index: places among the scan's views."""
         n = len(self.geometry)
-        found = []
+        matrices = []
         for part in self.parts:
             if part.varies == 'one':
-                found.append(np.ones((len(t), 1)))
+                matrices.append(np.ones((len(t), 1)))
             elif part.varies == 'smooth':
-                found.append(legendre.legvander(np.clip(t, -1, 1), len(part.values) - 1))
+                matrices.append(legendre.legvander(np.clip(t, -1, 1), len(part.values) - 1))
             else:  # between neighbours
-                found.append(np.maximum(0, 1 - np.abs(np.asarray(index, float)[:, None] - np.arange(n))))
-        return found
+                matrices.append(np.maximum(0, 1 - np.abs(np.asarray(index, float)[:, None] - np.arange(n))))
+        return matrices
 
 
 def _values(part, numbers):

@@ -90,11 +90,11 @@ class Poses:
         """
         if self.projection is None:
             return geometry
-        t, own = scan_times(scan, geometry.angles), np.linspace(-1, 1, len(self.turn))
+        t, knots = scan_times(scan, geometry.angles), np.linspace(-1, 1, len(self.turn))
         there = Poses(len(geometry))
         for name in ('turn', 'shift'):
             values = getattr(self, name)
-            setattr(there, name, np.stack([np.interp(t, own, column) for column in values.T], 1))
+            setattr(there, name, np.stack([np.interp(t, knots, column) for column in values.T], 1))
         return there.corrected(geometry.on(scan.grid))
 
     def step(self, view: int, rays: Rays, gradient: np.ndarray, rate: float, adam: Rates) -> None:

@@ -32,9 +32,9 @@ def largest_density(scan: Scan) -> float:
     rough = float(scan.projections.max()) * scan.geometry.grid.scale / THINNEST
     if not can_rectify(scan):
         return rough
-    found = ROOM * float(np.quantile(run_algorithm(scan, FDK()).volume, SHARE))
+    density = ROOM * float(np.quantile(run_algorithm(scan, FDK()).volume, SHARE))
     # Three digits, so that a fit that goes on has the same unit, whatever the rounding of a reconstruction made anew.
-    return float(f'{found:.3g}') if found > 0 else rough
+    return float(f'{density:.3g}') if density > 0 else rough
 
 
 def mean_density(scan: Scan) -> float:

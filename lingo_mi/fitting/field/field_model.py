@@ -41,7 +41,7 @@ class FieldModel(Model):
 
     def integrals(self, values: dict, row: Any, x: Any, y: Any, within: Any) -> Any:
         """Line integrals along rays of a view, as `rays.integrals` gives them, in the fit's unit times normalised length."""
-        found = integrals(
+        result = integrals(
             lambda points: self.network.density(values, points),
             self.cube,
             row,
@@ -50,7 +50,7 @@ class FieldModel(Model):
             self.options.field_samples,
             within,
         )
-        return found * dr.opaque(mi.Float, self.geometry.grid.scale)
+        return result * dr.opaque(mi.Float, self.geometry.grid.scale)
 
     def render(
         self, state: DeviceState, geometry: Geometry, progress: Callable[[int, int], None] | None = None
@@ -82,14 +82,14 @@ class FieldModel(Model):
 
         It is 0 outside the scan's volume, where no ray has sampled it.
         """
-        own = self.geometry.grid
-        grid = grid or own
-        shift = np.array(grid.centre) - np.array(own.centre)
+        scan_grid = self.geometry.grid
+        grid = grid or scan_grid
+        shift = np.array(grid.centre) - np.array(scan_grid.centre)
         axes = [
-            ((np.arange(n) + 0.5 - n / 2) * d + s) / own_d + (own_n - 1) / 2
-            for n, d, s, own_n, own_d in zip(grid.shape, grid.spacing, shift, own.shape, own.spacing)
+            ((np.arange(n) + 0.5 - n / 2) * d + s) / scan_d + (scan_n - 1) / 2
+            for n, d, s, scan_n, scan_d in zip(grid.shape, grid.spacing, shift, scan_grid.shape, scan_grid.spacing)
         ]
-        inside = [(a > -0.5 - 1e-6) & (a < n - 0.5 + 1e-6) for a, n in zip(axes, own.shape)]
+        inside = [(a > -0.5 - 1e-6) & (a < n - 0.5 + 1e-6) for a, n in zip(axes, scan_grid.shape)]
         out = np.zeros(int(np.prod(grid.shape)), np.float32)
         chosen = np.flatnonzero(inside[0][:, None, None] & inside[1][:, None] & inside[2])
         for first in range(0, len(chosen), POINTS):

@@ -56,8 +56,8 @@ def known_options(text: str, values: Mapping[str, Any]) -> dict[str, Any]:
 
     Values that are not options are passed over: `start=masks` brings options that other starts do not have.
     """
-    known = method_of(text).flat()
-    return method_of(text, **{name: value for name, value in values.items() if name in known}).flat()
+    accepted = method_of(text).flat()
+    return method_of(text, **{name: value for name, value in values.items() if name in accepted}).flat()
 
 
 def changes_of(text: str) -> list[str]:

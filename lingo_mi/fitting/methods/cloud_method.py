@@ -12,7 +12,7 @@ from typing_extensions import Self
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.memory import room
-from lingo_mi.common.runtime import one_at_a_time
+from lingo_mi.common.runtime import drjit_lock
 from lingo_mi.fitting import state as states
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.measured import density_unit, trusted
@@ -110,7 +110,7 @@ class CloudMethod(Method):
             raise InputError('the source lies within the volume or close to it: check DSO, nVoxel and dVoxel')
         return replace(method, bounds=replace(self.bounds, scale_max=min(self.bounds.scale_max, largest)))
 
-    @one_at_a_time()
+    @drjit_lock()
     def starting_cloud(self, scan: Scan, seed: int = 0) -> StartingCloud:
         """The cloud that a fit of the scan starts from. `info['seconds']` is the whole time that it took.
 

@@ -82,8 +82,10 @@ class DensityMethod(CloudMethod):
         return replace(method, loss=self.loss.limited(len(scan)))
 
     def model(self, geometry: Geometry, unit: float, effects: Effects | None = None) -> DensityModel:
-        own = self.corrections
-        response = Response.of(geometry, air=own.fit_air, gain=own.fit_gain, pixels=own.fit_pixels)
+        corrections = self.corrections
+        response = Response.of(
+            geometry, air=corrections.fit_air, gain=corrections.fit_gain, pixels=corrections.fit_pixels
+        )
         return DensityModel(self.forward, geometry, unit, effects, response, self.extent)
 
     def poses(self, geometry: Geometry) -> Poses | None:

@@ -49,8 +49,8 @@ class AlphaCompositing(ForwardModel):
 
     def initial(self, n: int, density: np.ndarray | None) -> dict[str, np.ndarray]:
         """Opacity 0.1 and half grey for all Gaussians (3DGS). The density is not used."""
-        own = {k: np.zeros((n, size)) for k, size in self.parameters.items() if k not in SHAPE}
-        return own | {'opacity': np.full((n, 1), inverse_sigmoid(OPACITY))}
+        appearance = {k: np.zeros((n, size)) for k, size in self.parameters.items() if k not in SHAPE}
+        return appearance | {'opacity': np.full((n, 1), inverse_sigmoid(OPACITY))}
 
     def amount(self, values: dict[str, np.ndarray]) -> np.ndarray:
         return sigmoid(values['opacity'][:, 0].astype(float))

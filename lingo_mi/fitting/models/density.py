@@ -75,14 +75,20 @@ class DensityModel(CloudModel):
         return super().render(state, geometry)
 
     def volume(self, state: DeviceState, grid: Grid | None = None) -> np.ndarray:
-        own, gaussians, wanted = self.geometry.grid, self.forward.gaussians(state.values), grid or self.geometry.grid
+        scan_grid, gaussians, wanted = (
+            self.geometry.grid,
+            self.forward.gaussians(state.values),
+            grid or self.geometry.grid,
+        )
 
         def values(part):
             if part is None:
-                cells = Lattice(vector64(-own.half), vector64(2 * own.half / own.shape), own.shape)
+                cells = Lattice(
+                    vector64(-scan_grid.half), vector64(2 * scan_grid.half / scan_grid.shape), scan_grid.shape
+                )
             else:
-                low, step = part.low - own.centre, np.array(part.spacing)
-                cells = Lattice(vector64(low * own.scale), vector64(step * own.scale), part.shape)
+                low, step = part.low - scan_grid.centre, np.array(part.spacing)
+                cells = Lattice(vector64(low * scan_grid.scale), vector64(step * scan_grid.scale), part.shape)
             return cells.volume(voxelize(*gaussians, grid=cells, extent=self.extent, deep=True))
 
         if math.prod(wanted.shape) <= AT_ONCE:

@@ -87,11 +87,11 @@ class Part:
         0.1
         """
         new, values = self._with_kinds(values)
-        known = new.flat()
+        accepted = new.flat()
         for name in values:
-            if name not in known:
+            if name not in accepted:
                 raise InputError(
-                    f'unknown setting {name!r}{nearest(name, known) or f": see the documentation of {type(self).__name__}"}'
+                    f'unknown setting {name!r}{nearest(name, accepted) or f": see the documentation of {type(self).__name__}"}'
                 )
         return new._changed(values)
 
@@ -107,8 +107,8 @@ class Part:
                 if wanted != part.name:
                     shared = {g.name for g in fields(kinds[wanted])} & {g.name for g in fields(part)}
                     usual = {g.name: g.default for g in fields(part)}
-                    kept = {k: getattr(part, k) for k in shared if getattr(part, k) != usual[k]}
-                    changes[f.name] = kinds[wanted](**kept)
+                    unchanged = {k: getattr(part, k) for k in shared if getattr(part, k) != usual[k]}
+                    changes[f.name] = kinds[wanted](**unchanged)
                 values = {k: v for k, v in values.items() if k != f.name}
         return (replace(self, **changes) if changes else self), values
 

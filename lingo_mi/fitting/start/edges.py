@@ -74,18 +74,18 @@ class EdgeStart(NumberedStart):
 
 def _masked(weight: np.ndarray, scan: Scan) -> tuple[np.ndarray, dict[str, Any]]:
     """The weight of each voxel [x, y, z], zero outside the masks of all views, and what the masks are."""
-    found = masks(np.asarray(scan.normalised, np.float32), valid=scan.valid)
-    outside = 'ignore' if truncated(found).any() else 'invalid'
+    object_masks = masks(np.asarray(scan.normalised, np.float32), valid=scan.valid)
+    outside = 'ignore' if truncated(object_masks).any() else 'invalid'
     low, _ = valid_voxels(
-        scan.geometry.normalised_rays(), found, weight.shape, scan.geometry.grid.half, outside=outside
+        scan.geometry.normalised_rays(), object_masks, weight.shape, scan.geometry.grid.half, outside=outside
     )
     inside = np.zeros(weight.shape, bool)
     inside.ravel()[low] = True
     masked = np.where(ndimage.maximum_filter(inside, 3), weight, 0)
     lost = 1 - masked.sum() / weight.sum()
     info = dict(
-        T_high=float(found.t_high.mean()),
-        T_low=float(found.t_low.mean()),
+        T_high=float(object_masks.t_high.mean()),
+        T_low=float(object_masks.t_low.mean()),
         grid=weight.shape,
         cells_low=len(low),
         edges_lost=float(lost),

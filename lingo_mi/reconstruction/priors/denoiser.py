@@ -53,10 +53,10 @@ class Denoiser(Prior):
 
     def prox(self, x, strength, size, upper=inf):
         try:
-            found = self.function(x.numpy().reshape(size), strength)
+            denoised = self.function(x.numpy().reshape(size), strength)
         except Exception as error:
             raise InputError(f'the denoiser fails: {type(error).__name__}: {error}'.splitlines()[0]) from error
-        volume = as_numpy(found, 'what the denoiser returns', np.float32)
+        volume = as_numpy(denoised, 'what the denoiser returns', np.float32)
         if volume.shape != tuple(size):
             raise InputError(f'the denoiser returns the shape {volume.shape} for a volume of the shape {tuple(size)}')
         if not np.isfinite(volume).all():

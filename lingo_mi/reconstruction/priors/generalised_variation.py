@@ -57,17 +57,17 @@ class TGV(Prior):
         self.begin()
 
     def begin(self) -> None:
-        self._kept: tuple[list[Any], list[Any], list[Any]] | None = None
+        self._state: tuple[list[Any], list[Any], list[Any]] | None = None
 
     def prox(self, x, strength, size, upper=inf):
         if strength <= 0:
             return super().prox(x, strength, size, upper)
-        kept = self._kept
-        if kept is None or dr.width(kept[0][0]) != dr.width(x):
-            kept = [dr.zeros(mi.Float, dr.width(x)) for _ in range(12)]
-            kept = kept[:3], kept[3:6], kept[6:]
+        state = self._state
+        if state is None or dr.width(state[0][0]) != dr.width(x):
+            state = [dr.zeros(mi.Float, dr.width(x)) for _ in range(12)]
+            state = state[:3], state[3:6], state[6:]
         first, second = (dr.opaque(mi.Float, w) for w in (strength, strength * self.second))
-        v, p, q = kept
+        v, p, q = state
         z = x_bar = clipped(x - transposed(p, size), upper)
         v_bar = v
         dr.eval(z)
@@ -81,7 +81,7 @@ class TGV(Prior):
             x_bar, v_bar = 2 * new - z, [2 * a - b for a, b in zip(moved, v)]
             dr.eval(new, moved, x_bar, v_bar)
             z, v = new, moved
-        self._kept = v, p, q
+        self._state = v, p, q
         return z
 
 

@@ -91,8 +91,8 @@ class PriorSum(Prior):
         return z
 
     def gradient(self, x, size):
-        found = [(prior.gradient(x, size), weight) for prior, weight in self._parts]
-        terms = [dr.opaque(mi.Float, weight) * g for g, weight in found if g is not None]
+        gradients = [(prior.gradient(x, size), weight) for prior, weight in self._parts]
+        terms = [dr.opaque(mi.Float, weight) * g for g, weight in gradients if g is not None]
         if not terms:
             return None
         total = sum(terms[1:], terms[0])

@@ -69,9 +69,9 @@ class Wavelets(Prior):
         pywt, block = _pywt(), 2**self.level
         offset = self._offsets.integers(0, block, 3) if self.shifts else (0, 0, 0)
         volume = np.pad(x.numpy().reshape(size), [(0, -n % block) for n in size], mode='edge')
-        kept = pywt.wavedecn(np.roll(volume, offset, (0, 1, 2)), self.wavelet, MODE, self.level)
-        few = [{name: pywt.threshold(c, strength, 'soft') for name, c in scale.items()} for scale in kept[1:]]
-        back = pywt.waverecn([kept[0], *few], self.wavelet, MODE)
+        coefficients = pywt.wavedecn(np.roll(volume, offset, (0, 1, 2)), self.wavelet, MODE, self.level)
+        few = [{name: pywt.threshold(c, strength, 'soft') for name, c in scale.items()} for scale in coefficients[1:]]
+        back = pywt.waverecn([coefficients[0], *few], self.wavelet, MODE)
         out = np.roll(back, [-o for o in offset], (0, 1, 2))[tuple(map(slice, size))]
         z = clipped(uploaded(np.ascontiguousarray(out, np.float32)), upper)
         dr.eval(z)
