@@ -21,23 +21,23 @@ def cells(page: str) -> dict[str, list[list[str]]]:
     >>> cells(chr(10).join(['# Times', '| a | b |', '|---|---:|', '| 1 | 2.0 |']))
     {'Times': [['a', 'b'], ['1', '2.0']]}
     """
-    found: dict[str, list[list[str]]] = {}
+    tables: dict[str, list[list[str]]] = {}
     heading = ''
     for line in page.splitlines():
         if line.startswith('#'):
             heading = line.lstrip('#').strip()
         elif line.startswith('|') and not re.fullmatch(r'[|:\- ]+', line):
-            found.setdefault(heading, []).append([cell.strip() for cell in line.strip().strip('|').split('|')])
-    return found
+            tables.setdefault(heading, []).append([cell.strip() for cell in line.strip().strip('|').split('|')])
+    return tables
 
 
 def store(page: Path, folder: Path) -> list[Path]:
     """Write the tables of a page as CSV files: PAGE.csv, or PAGE_HEADING.csv if there are several. Returns the files."""
     with reading(page):
-        found = cells(page.read_text(encoding='utf-8'))
+        tables = cells(page.read_text(encoding='utf-8'))
     paths = []
-    for heading, rows in found.items():
-        name = page.stem if len(found) == 1 else f'{page.stem}_{re.sub("[^a-z0-9]+", "_", heading.lower())}'
+    for heading, rows in tables.items():
+        name = page.stem if len(tables) == 1 else f'{page.stem}_{re.sub("[^a-z0-9]+", "_", heading.lower())}'
         paths.append(folder / f'{name}.csv')
         with replacing(paths[-1]) as temporary, temporary.open('w', encoding='utf-8', newline='') as file:
             csv.writer(file, lineterminator='\n').writerows(rows)

@@ -27,12 +27,12 @@ class CellFiles:
     def get(self, case: str, setting: str) -> dict | None:
         """A stored cell, or None where there is none that can be read."""
         try:
-            found = json.loads(self.path(case, setting).read_text(encoding='utf-8'))
+            cell = json.loads(self.path(case, setting).read_text(encoding='utf-8'))
         except (OSError, ValueError):
             return None
-        return found if isinstance(found, dict) and found.keys() >= set(self.needed) else None
+        return cell if isinstance(cell, dict) and cell.keys() >= set(self.needed) else None
 
-    def put(self, case: str, setting: str, found: dict) -> None:
+    def put(self, case: str, setting: str, cell: dict) -> None:
         path = self.path(case, setting)
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, json.dumps(found, indent=1) + '\n')
+        write_text(path, json.dumps(cell, indent=1) + '\n')

@@ -60,10 +60,10 @@ def main() -> int:
         for i, sm in enumerate(args.sm):
             noise = args.noise and i == 0
             title = f'sm_{sm}, noise, checked' if noise else f'sm_{sm}'
-            outcomes[title], found = run_tests(
+            outcomes[title], compiled = run_tests(
                 stand_in, args.tests, names, sm=sm, noise=noise, cells=cells, report=show
             )
-            kernels += found
+            kernels += compiled
     text = page(outcomes, kernels)
     print(text)
     if args.markdown:

@@ -25,9 +25,9 @@ def simulated(name: str, size: int, pixels: int, views: int, finer: int) -> tupl
     finer : int
         How many times as many voxels are scanned along each side.
     """
-    thing = load_object(name, size * finer)
-    truth = averaged(thing, size)
-    geometry = default_geometry(thing, circular(views), pixels)
-    line_integrals = grid.project_volume(thing.data, geometry)
+    phantom = load_object(name, size * finer)
+    truth = averaged(phantom, size)
+    geometry = default_geometry(phantom, circular(views), pixels)
+    line_integrals = grid.project_volume(phantom.data, geometry)
     unit = np.float32(LARGEST / line_integrals.max())
     return geometry.on(truth.grid), line_integrals * unit, truth.data * unit

@@ -182,20 +182,20 @@ def check_output(out: Path, args: argparse.Namespace) -> None:
     require_writable(page.parent, page, 'choose another --report')
 
 
-def algorithm_of(args: argparse.Namespace, given: dict[str, str]) -> Algorithm | None:
+def algorithm_of(args: argparse.Namespace, values: dict[str, str]) -> Algorithm | None:
     """The algorithm with the -D values of its options, which have the types of their defaults; None: voxelize."""
-    name, made = args.algorithm, ALGORITHMS.get(args.algorithm)
-    known = {k: v for k, v in made().options.items() if not isinstance(v, Prior)} if made else {}
+    name, algorithm = args.algorithm, ALGORITHMS.get(args.algorithm)
+    accepted = {k: v for k, v in algorithm().options.items() if not isinstance(v, Prior)} if algorithm else {}
     options: dict = {}
-    for option, text in given.items():
-        if option not in known:
+    for option, text in values.items():
+        if option not in accepted:
             raise InputError(
-                f'-D {option}: neither a parameter of the scene nor of {name} ({", ".join(known) or "it has none"})'
+                f'-D {option}: neither a parameter of the scene nor of {name} ({", ".join(accepted) or "it has none"})'
             )
-        options[option] = parse(f'-D {option}', text, 0.0 if known[option] is None else known[option])
+        options[option] = parse(f'-D {option}', text, 0.0 if accepted[option] is None else accepted[option])
     if args.start and options.get('completed_niter'):
         raise InputError('-D completed_niter must be 0 with --start, which completes no views: leave it out')
-    return made(**options) if made else None
+    return algorithm(**options) if algorithm else None
 
 
 def main() -> None:
@@ -203,8 +203,8 @@ def main() -> None:
     use_variant(args.variant)
     check_arguments(args)
     args.scene = scene_path(args.scene)
-    defined, own = definitions(args.define), defaults(args.scene)
-    options = {k: v for k, v in defined.items() if k not in own}
+    defined, scene_parameters = definitions(args.define), defaults(args.scene)
+    options = {k: v for k, v in defined.items() if k not in scene_parameters}
     effects = options.pop('effects', 'model')
     if effects not in ('model', 'ignore') or effects == 'ignore' and (args.complete or args.start):
         raise InputError(
@@ -215,7 +215,7 @@ def main() -> None:
     check_output(out, args)
     with writing_file(out):  # refuses, before the work, what another process writes
         pass
-    scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in own}, args.slab or 0)
+    scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in scene_parameters}, args.slab or 0)
     fit = load_fit(args.complete or args.start) if args.complete or args.start else None
     if fit is not None and (args.start or args.algorithm in ('refined', 'voxelize')):
         require_volume(fit)
@@ -232,10 +232,10 @@ def main() -> None:
     began = time.perf_counter()
     if algorithm is None:
         assert fit is not None  # see `check_arguments`
-        found = voxelized(fit, dataset.train.geometry.grid, out, args)
+        result = voxelized(fit, dataset.train.geometry.grid, out, args)
     else:
         total = args.views if args.complete else None
-        found = reconstruct(
+        result = reconstruct(
             dataset,
             algorithm,
             start=fit,
@@ -246,7 +246,7 @@ def main() -> None:
             force=args.force,
             **units_of(args),
         )
-    if isinstance(found, Path):
+    if isinstance(result, Path):
         shape = ' x '.join(map(str, dataset.train.geometry.grid.shape))
         seconds = time.perf_counter() - began
         print(f'{args.algorithm}, {shape} voxels in slabs of {args.slab} slices: {seconds:.1f} s\n{out}')
@@ -255,7 +255,7 @@ def main() -> None:
         views = measured or len(scanner)
         completed = args.complete and args.algorithm != 'refined'  # which meets the measured views last
         of = f'a fit to {views}' if args.algorithm == 'voxelize' else str(args.views if completed else views)
-        show(found, of, views, scanner, dataset.volume, out, args)
+        show(result, of, views, scanner, dataset.volume, out, args)
 
 
 def voxelized(fit: Fit, grid: Grid, out: Path, args: argparse.Namespace) -> Reconstruction | Path:
@@ -264,13 +264,13 @@ def voxelized(fit: Fit, grid: Grid, out: Path, args: argparse.Namespace) -> Reco
         if args.slab:
             return fit.save_volume(out, grid, slab=args.slab, cluster=args.cluster, force=args.force, **units_of(args))
         began = time.perf_counter()
-        found = Reconstruction(fit.volume(grid), [], time.perf_counter() - began, grid)
-        found.save(out, force=args.force, **units_of(args))
-        return found
+        result = Reconstruction(fit.volume(grid), [], time.perf_counter() - began, grid)
+        result.save(out, force=args.force, **units_of(args))
+        return result
 
 
 def show(
-    found: Reconstruction,
+    result: Reconstruction,
     of: str,
     measured: int,
     scanner: Geometry,
@@ -280,27 +280,27 @@ def show(
 ) -> None:
     """Print how a volume was made of views, and how good it is; write the page. measured: how many of them were."""
     missed = ''
-    if found.residuals:
-        missed = f', |A x - b| / |b| = {found.residuals[-1]:.4g} after {len(found.residuals) - 1} iterations'
-    print(f'{args.algorithm} of {of} views: {found.seconds:.1f} s{missed}')
-    if found.grid != scanner.grid:
+    if result.residuals:
+        missed = f', |A x - b| / |b| = {result.residuals[-1]:.4g} after {len(result.residuals) - 1} iterations'
+    print(f'{args.algorithm} of {of} views: {result.seconds:.1f} s{missed}')
+    if result.grid != scanner.grid:
         truth = None  # it has other voxels
-    numbers = {} if truth is None else found.metrics(truth)
+    numbers = {} if truth is None else result.metrics(truth)
     if numbers:
         print(volume_quality(numbers))
     print(out)
     if args.report is not None:
         data = ReportData(
             title=f'{input_name(args)}, {args.algorithm}',
-            metrics=numbers | dict(method=args.algorithm, views=measured, seconds=found.seconds),
-            volume=found.volume,
+            metrics=numbers | dict(method=args.algorithm, views=measured, seconds=result.seconds),
+            volume=result.volume,
             truth=truth,
-            spacing=found.grid.spacing,
-            centre=found.grid.centre,
+            spacing=result.grid.spacing,
+            centre=result.grid.centre,
             scanner=scanner,
-            error_map=found.error if isinstance(found, Chosen) else None,
+            error_map=result.error if isinstance(result, Chosen) else None,
             command=command_line(),
         )
         print(Page(report_page(data)).save(args.report, force=args.force))
-    if isinstance(found, Chosen):
-        print(found.report())
+    if isinstance(result, Chosen):
+        print(result.report())

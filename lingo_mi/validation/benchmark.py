@@ -112,8 +112,8 @@ class Bench:
 
     def pairs(self) -> float:
         """`count_pairs` of the cloud in the first view."""
-        thing = find_objects(self.scene)[0]
-        columns = thing.centre, thing.scale, thing.rotation, thing.density
+        gaussians = find_objects(self.scene)[0]
+        columns = gaussians.centre, gaussians.scale, gaussians.rotation, gaussians.density
         return count_pairs(columns, view_of(self.sensors[0]), self.work.extent)
 
     def times(self) -> dict:
@@ -172,24 +172,24 @@ class Bench:
         columns = self.data[:, :3], self.data[:, 3:6], self.data[:, 6:], self.density[:, 0]
         image, gradients = rays_and_gradients(columns, starts, directions, weights[chosen])
 
-        def errors(found, by_data, by_density):
+        def errors(rendered, by_data, by_density):
             by_data = by_data.reshape(-1, 10)
             by = (by_data[:, :3], by_data[:, 3:6], by_data[:, 6:], by_density)
             worst = max(np.linalg.norm(a - gradients[k]) / np.linalg.norm(gradients[k]) for k, a in zip(NAMES, by))
-            return float(np.linalg.norm(found[chosen] - image) / np.linalg.norm(image)), float(worst)
+            return float(np.linalg.norm(rendered[chosen] - image) / np.linalg.norm(image)), float(worst)
 
         ours: Any = mi.render(self.scene, self.params, sensor=self.sensors[0])
         dr.backward(ours * mi.TensorXf(weights.reshape(ours.shape)))
         by_ours: list[Any] = [dr.grad(self.params[name]) for name in KEYS]
-        found = errors(ours.numpy().ravel(), *(x.numpy() for x in by_ours))
-        out = dict(zip(('image_error', 'gradient_error'), found))
+        our_errors = errors(ours.numpy().ravel(), *(x.numpy() for x in by_ours))
+        out = dict(zip(('image_error', 'gradient_error'), our_errors))
 
         tree = Tree(mi.TensorXf(self.data), mi.TensorXf(self.density), self.work.extent, EPSILON)
         start = rays(view, 2 * 128.0)
-        one: Any = [type(x)(dr.gather(type(x), x, dr.arange(mi.UInt32, 1))) for x in start]
-        dr.eval(one)
-        tree.image(*one)  # builds the tree, and compiles
-        tree.gradients(one[0], one[1], dr.opaque(mi.Float, 1))
+        first_ray: Any = [type(x)(dr.gather(type(x), x, dr.arange(mi.UInt32, 1))) for x in start]
+        dr.eval(first_ray)
+        tree.image(*first_ray)  # builds the tree, and compiles
+        tree.gradients(first_ray[0], first_ray[1], dr.opaque(mi.Float, 1))
         image_of_tree, forward = _timed(tree.image, *start)
         gradients_of_tree, backward = _timed(tree.gradients, *start, mi.Float(weights))
         of_tree = errors(image_of_tree.numpy(), *(x.numpy() for x in gradients_of_tree))
@@ -235,9 +235,9 @@ def describe_times(result: dict, repeats: int) -> str:
         f'cut-off {result["extent"]:g} sigma, {result["pairs"] / 1e6:.1f} M pairs; medians of {repeats} turns'
     ]
     ours, limits = ([result[f'{key}{name}_ns_per_pair'] for name in PASSES] for key in ('', 'limit_'))
-    for name, own, limit in zip(PASSES, ours, limits):
-        line = f'{name:9} {result[f"{name}_ms"]:7.1f} ms  {own:5.2f} ns a pair'
-        lines.append(line if limit is None else f'{line}   limit {limit:5.2f}   ratio {own / limit:.2f}')
+    for name, ns, limit in zip(PASSES, ours, limits):
+        line = f'{name:9} {result[f"{name}_ms"]:7.1f} ms  {ns:5.2f} ns a pair'
+        lines.append(line if limit is None else f'{line}   limit {limit:5.2f}   ratio {ns / limit:.2f}')
     if None not in limits:
         lines.append(f'together ratio {sum(ours) / sum(limits):.2f}')
     return '\n'.join(lines)

@@ -59,10 +59,10 @@ def image_and_gradients(
         rows, columns = (np.arange(*ends) for ends in zip(low[i], high[i]))
         box = np.ix_(rows, columns)
         g = weights[box] if weights is not None else None
-        one = tuple(x[i] for x in gaussians)
+        gaussian = tuple(x[i] for x in gaussians)
         for x, y, share in samples:
             start, direction = rays.through(0, *np.broadcast_arrays(columns + x, rows[:, None] + y))
-            value, by_row = _gaussian(one, start, direction, g)
+            value, by_row = _gaussian(gaussian, start, direction, g)
             image[box] += share * value
             if by_row is not None:
                 for name, row in zip(NAMES, by_row):
@@ -78,8 +78,8 @@ def rays_and_gradients(
     gaussians = [np.asarray(x, float) for x in gaussians]
     total: Any = 0.0
     rows = []
-    for one in zip(*gaussians):
-        value, row = _gaussian(one, start, direction, weights)
+    for gaussian in zip(*gaussians):
+        value, row = _gaussian(gaussian, start, direction, weights)
         total = total + value
         rows.append(row)
     return total, {name: np.array(column) for name, column in zip(NAMES, zip(*rows))}

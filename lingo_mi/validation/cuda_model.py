@@ -54,8 +54,8 @@ CARDS = (
 def times(kernel: dict, card: Card) -> dict[str, float]:
     """Seconds that a kernel needs each resource. kernel   as `count.difference` gives it"""
     warp, clocks = kernel['warp'], card.multiprocessors * card.clock
-    known = [capability for capability in LANES if capability <= card.capability]
-    fp32, integers, fp64 = LANES[max(known)] if known else LANES[75]
+    older = [capability for capability in LANES if capability <= card.capability]
+    fp32, integers, fp64 = LANES[max(older)] if older else LANES[75]
     lanes = dict(fp32=fp32, int=integers, fp64=fp64, mufu=SPECIAL)
     return dict(
         issue=sum(warp.values()) / (ISSUE * clocks),

@@ -220,7 +220,7 @@ def pose_gradients(cloud: Cloud, pose: Pose, weights: np.ndarray) -> dict[str, n
     return out
 
 
-def relative(found: ArrayLike, expected: ArrayLike) -> float:
+def relative(result: ArrayLike, expected: ArrayLike) -> float:
     """Root mean square deviation over that of the expected values."""
-    found, expected = np.ravel(found), np.ravel(expected)
-    return float(np.linalg.norm(found - expected) / np.linalg.norm(expected))
+    result, expected = np.ravel(result), np.ravel(expected)
+    return float(np.linalg.norm(result - expected) / np.linalg.norm(expected))

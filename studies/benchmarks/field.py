@@ -39,8 +39,8 @@ def main() -> None:
     p.add_argument('--variant', help='of Mitsuba')
     args = p.parse_args()
     variant = use_variant(args.variant)
-    found = measured(args.rays, args.samples, args.repeats)
-    (ours, our_cpu), (numpy, numpy_cpu) = found
+    results = measured(args.rays, args.samples, args.repeats)
+    (ours, our_cpu), (numpy, numpy_cpu) = results
     print(
         f'{variant}, {args.rays} rays x {args.samples} samples: Dr.Jit {our_cpu:.2f} s of CPU ({ours:.2f} s), NumPy '
         f'{numpy_cpu:.2f} s of CPU ({numpy:.2f} s), ratio {our_cpu / numpy_cpu:.2f} ({ours / numpy:.2f})'
@@ -131,8 +131,8 @@ class NumpyField:
 
     def density(self, points: np.ndarray) -> np.ndarray:
         """The field at points [N, 3] in [0, 1], [N]; keeps what `gradients` needs."""
-        self.found = list(self.corners(points))
-        encoded = [np.einsum('cn,cnf->nf', w, self.features[i]) for i, w in self.found]
+        self.corner_weights = list(self.corners(points))
+        encoded = [np.einsum('cn,cnf->nf', w, self.features[i]) for i, w in self.corner_weights]
         inputs = np.concatenate(encoded, 1)
         hidden, self.into, self.signs = inputs, [], []
         for k, (matrix, bias) in enumerate(self.layers):
@@ -162,7 +162,7 @@ class NumpyField:
         by_inputs = by_inputs + g
         by_features = np.zeros_like(self.features)
         size, entries = self.options.field_features, len(self.features)
-        for level, (index, weight) in enumerate(self.found):
+        for level, (index, weight) in enumerate(self.corner_weights):
             for f in range(size):
                 values = weight * by_inputs[:, level * size + f]
                 by_features[:, f] += np.bincount(index.ravel(), values.ravel(), entries).astype(self.dtype)
@@ -171,8 +171,8 @@ class NumpyField:
     def step(self, points: np.ndarray, length: np.floating, measured: np.ndarray, iteration: int) -> None:
         """One step of Adam on the mean squared error of line integrals; `length` of a sample's part of its ray."""
         rays = len(measured)
-        found = self.density(points).reshape(rays, -1).sum(1) * length
-        by_ray = 2 / rays * (found - measured) * length
+        density = self.density(points).reshape(rays, -1).sum(1) * length
+        by_ray = 2 / rays * (density - measured) * length
         gradients = self.gradients(np.repeat(by_ray, len(points) // rays))
         c1, c2 = 1 - 0.9 ** (iteration + 1), 1 - 0.999 ** (iteration + 1)
         for x, g, moments in zip(self.parameters(), gradients, self.moments):

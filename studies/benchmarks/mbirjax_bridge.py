@@ -59,7 +59,7 @@ def reconstruct(scan: Scan, mbirjax: Any, **settings: Any) -> np.ndarray:
         Of its model, such as sharpness=1.0.
     """
     require_every_pixel(scan, 'MBIRJAX')
-    made = model(scan.geometry, mbirjax)
-    made.set_params(**settings)
-    found, _ = made.recon(np.ascontiguousarray(scan.projections, np.float32), print_logs=False, logfile_path=None)
-    return np.asarray(found)[:, :, ::-1].copy()
+    ct_model = model(scan.geometry, mbirjax)
+    ct_model.set_params(**settings)
+    volume, _ = ct_model.recon(np.ascontiguousarray(scan.projections, np.float32), print_logs=False, logfile_path=None)
+    return np.asarray(volume)[:, :, ::-1].copy()

@@ -85,8 +85,8 @@ def mbir(geometry: Geometry, name: str) -> Pair:
     """MBIRJAX and its port mbirtorch, which have the same interface."""
     model = mbirjax_bridge.model(geometry, importlib.import_module(name))
 
-    def array(found):
-        return np.array(found)
+    def array(result):
+        return np.array(result)
 
     return Pair(
         lambda x: array(model.forward_project(np.ascontiguousarray(x[:, :, ::-1]))),
@@ -188,9 +188,9 @@ def _timed(function, argument, calls: int) -> tuple[np.ndarray, np.ndarray]:
     taken = []
     for _ in range(calls):
         cpu, wall = time.process_time(), time.perf_counter()
-        found = function(argument)
+        result = function(argument)
         taken.append((time.process_time() - cpu, time.perf_counter() - wall))
-    return found.astype(float), np.median(taken[-max(1, calls - 1) :], axis=0)
+    return result.astype(float), np.median(taken[-max(1, calls - 1) :], axis=0)
 
 
 def overhead(geometry: Geometry, turns: int) -> Iterator[tuple[str, float, float]]:
@@ -206,24 +206,24 @@ def overhead(geometry: Geometry, turns: int) -> Iterator[tuple[str, float, float
     }
     for name, library, convert in (('PyTorch', 'torch', 'as_tensor'), ('JAX', 'jax.numpy', 'asarray')):
         try:
-            made = getattr(importlib.import_module(library), convert)
+            converter = getattr(importlib.import_module(library), convert)
         except ImportError:
             continue
-        kinds[name] = made(x), made(y)
+        kinds[name] = converter(x), converter(y)
     bare = (lambda v: dr.eval(kernels.forward(v, block)), lambda v: dr.eval(kernels.adjoint(v, block)))
     least = {name: [np.inf, np.inf] for name in kinds}
     for _ in range(turns):
         for name, values in kinds.items():
             for i, call in enumerate(bare if name == 'bare kernel' else (A, A.T)):
                 begun = time.process_time()
-                found = call(values[i])
-                getattr(found, 'block_until_ready', lambda: None)()
+                result = call(values[i])
+                getattr(result, 'block_until_ready', lambda: None)()
                 dr.sync_thread()
                 least[name][i] = min(least[name][i], time.process_time() - begun)
     kernel = least.pop('bare kernel')
     yield 'bare kernel', kernel[0], kernel[1]
-    for name, found in least.items():
-        yield name, found[0] - kernel[0], found[1] - kernel[1]
+    for name, result in least.items():
+        yield name, result[0] - kernel[0], result[1] - kernel[1]
 
 
 def main() -> None:

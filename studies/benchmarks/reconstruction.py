@@ -82,11 +82,11 @@ def describe(result: dict) -> Iterator[str]:
         f'{side}^3 voxels, {result["views"]} views of {side} x {side} pixels, tilted by {result["tilt"]:g} degrees, '
         f'{result["variant"]}, {result["cores"]} cores, medians of {result["repeats"]} repeats'
     )
-    for operation, found in result['operations'].items():
-        parts = [f'{operation:9} ours {found["ours"]["seconds"]:8.3f} s']
+    for operation, numbers in result['operations'].items():
+        parts = [f'{operation:9} ours {numbers["ours"]["seconds"]:8.3f} s']
         parts += [
             f'{name} {x["seconds"]:8.3f} s, ratio {x["ratio"]:6.2f}, deviation {x["deviation"]:.2g}'
-            for name, x in found.items()
+            for name, x in numbers.items()
             if name != 'ours'
         ]
         yield '   '.join(parts)
@@ -163,8 +163,8 @@ def diffct(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
         return torch.from_numpy(np.ascontiguousarray(scan.projections.transpose(0, 2, 1)))
 
     def project():
-        found = projector.project(torch.from_numpy(np.ascontiguousarray(volume.transpose(2, 1, 0))))
-        return found.numpy().transpose(0, 2, 1)
+        image = projector.project(torch.from_numpy(np.ascontiguousarray(volume.transpose(2, 1, 0))))
+        return image.numpy().transpose(0, 2, 1)
 
     def reconstruct():
         angles = torch.tensor(geometry.angles, dtype=torch.float32)
@@ -185,16 +185,16 @@ def compare(packages: dict[str, Operations], repeats: int) -> dict:
                 if operation not in functions:
                     continue
                 begun = time.perf_counter()
-                found = functions[operation]()
+                result = functions[operation]()
                 if turn:
                     seconds.setdefault((operation, name), []).append(time.perf_counter() - begun)
                     continue
                 if operation != 'projector':
-                    found = found[1:-1, 1:-1, 1:-1]
+                    result = result[1:-1, 1:-1, 1:-1]
                 if name == 'ours':
-                    reference = found.copy()
+                    reference = result.copy()
                 else:
-                    deviation[operation, name] = float(np.linalg.norm(found - reference) / np.linalg.norm(reference))
+                    deviation[operation, name] = float(np.linalg.norm(result - reference) / np.linalg.norm(reference))
     out = {}
     for (operation, name), taken in seconds.items():
         entry = out.setdefault(operation, {})[name] = dict(seconds=float(np.median(taken)))

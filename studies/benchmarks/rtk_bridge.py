@@ -130,27 +130,27 @@ def total_variation(scan: Scan, itk: Any, beta: float, alpha: float = 0.1, niter
 def project(volume: np.ndarray, geometry: Geometry, itk: Any) -> np.ndarray:
     """Projections [view, v, u] of a volume [x, y, z] by RTK's Joseph projector."""
     zeros = np.zeros((len(geometry), *geometry.nDetector))
-    found = _filter(
+    image = _filter(
         'JosephForwardProjectionImageFilter',
         geometry,
         itk,
         projection_image(zeros, geometry, itk),
         volume_image(volume, geometry, itk),
     )
-    return itk.array_from_image(found)[:, ::-1]
+    return itk.array_from_image(image)[:, ::-1]
 
 
 def backproject(scan: Scan, itk: Any) -> np.ndarray:
     """Volume [x, y, z] of a scan by the transpose of that projector."""
     geometry = scan.geometry
-    found = _filter(
+    volume_out = _filter(
         'JosephBackProjectionImageFilter',
         geometry,
         itk,
         volume_image(np.zeros(geometry.grid.shape), geometry, itk),
         projection_image(scan.projections, geometry, itk),
     )
-    return array(found, itk)
+    return array(volume_out, itk)
 
 
 def _filter(name, geometry, itk: Any, *inputs):

@@ -82,10 +82,10 @@ def measured(fit: Fit, repeats: int) -> dict[str, float]:
         'Adam': taken['Adam'],
         'a step': whole,
     }
-    found = {name: float(np.median(seconds)) for name, seconds in parts.items()}
-    step = found.pop('a step')
-    found['the rest'] = step - sum(found.values())
-    return found | {'a step': step, 'densification': _renewal(steppers['whole'], state, rng)}
+    medians = {name: float(np.median(seconds)) for name, seconds in parts.items()}
+    step = medians.pop('a step')
+    medians['the rest'] = step - sum(medians.values())
+    return medians | {'a step': step, 'densification': _renewal(steppers['whole'], state, rng)}
 
 
 def _parts_of_the_loss(loss: Loss) -> list[str]:
@@ -107,16 +107,16 @@ def _renewal(stepper, state, rng):
     return (time.perf_counter() - began) * len(due) / iterations
 
 
-def described(found: dict[str, float]) -> str:
+def described(medians: dict[str, float]) -> str:
     """A Markdown table, and how a step compares with the integrator alone."""
-    whole = found['a step']
+    whole = medians['a step']
     rows = table(
         [
             ('part', lambda row: row[0]),
             ('ms', lambda row: f'{row[1] * 1e3:.1f}'),
             ('of a step', lambda row: f'{100 * row[1] / whole:.0f} %'),
         ],
-        found.items(),  # type: ignore[arg-type] - rows of any kind do
+        medians.items(),  # type: ignore[arg-type] - rows of any kind do
     )
-    ratio = whole / (found['integrator, forward'] + found['integrator, backward'])
+    ratio = whole / (medians['integrator, forward'] + medians['integrator, backward'])
     return f'{rows}\n\nA step takes {ratio:.2f} times as long as the integrator, forward and backward.'

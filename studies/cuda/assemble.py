@@ -80,13 +80,15 @@ def assemble(module: Path, sm: int, test: str = '') -> list[Kernel]:
     with tempfile.TemporaryDirectory() as folder:
         command = [find_ptxas(), '-v', '-O3', f'-arch=sm_{sm}', module, '-o', Path(folder) / 'kernel.cubin']
         done = subprocess.run(command, capture_output=True, text=True)
-    said = done.stdout + done.stderr
+    output = done.stdout + done.stderr
     if done.returncode:
-        reason = next((line.strip() for line in said.splitlines() if 'error' in line or 'fatal' in line), said.strip())
+        reason = next(
+            (line.strip() for line in output.splitlines() if 'error' in line or 'fatal' in line), output.strip()
+        )
         return [Kernel(name, test, sm, lines, error=reason) for name in names]
     out = []
     for name in names:
-        part = said.partition(f"Compiling entry function '{name}'")[2].partition('Compiling entry function')[0]
+        part = output.partition(f"Compiling entry function '{name}'")[2].partition('Compiling entry function')[0]
         stores, loads = re.search(r'(\d+) bytes spill stores, (\d+) bytes spill loads', part).groups()  # type: ignore
         registers = re.search(r'Used (\d+) registers', part)
         out.append(Kernel(name, test, sm, lines, int(registers[1]) if registers else 0, int(stores) + int(loads)))

@@ -81,8 +81,8 @@ def main() -> None:
     p.add_argument('--json', type=Path, required=True)
     args = p.parse_args()
     clouds = dict(foot=args.foot, chest=args.chest, giants='giants')
-    found = {name: counted(args.stand_in, cloud) for name, cloud in clouds.items()}
-    write_text(args.json, json.dumps(found, indent=1) + '\n')
+    counts = {name: counted(args.stand_in, cloud) for name, cloud in clouds.items()}
+    write_text(args.json, json.dumps(counts, indent=1) + '\n')
 
 
 if __name__ == '__main__':

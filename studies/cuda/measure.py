@@ -89,7 +89,7 @@ def main() -> None:
     args = p.parse_args()
     variant = use_variant(args.variant)
     fit = load_fit(args.checkpoint)
-    found = measured(fit, args.repeats)
+    results = measured(fit, args.repeats)
     model = expected(len(fit)) if variant.startswith('cuda') else {}
     columns = [
         ('work', lambda row: row[0]),
@@ -100,7 +100,7 @@ def main() -> None:
         ('those, ms', lambda row: f'{row[1]["of_short"]:.2f}'),
         ('in a row, ms', lambda row: f'{1e3 * row[1]["seconds"]:.2f}' if 'seconds' in row[1] else ''),
     ]
-    print(table(columns, found.items()))  # type: ignore[arg-type] - rows of any kind do
+    print(table(columns, results.items()))  # type: ignore[arg-type] - rows of any kind do
 
 
 if __name__ == '__main__':

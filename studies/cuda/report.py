@@ -14,9 +14,9 @@ from lingo_mi.validation.cuda_model import CARDS, counts, seconds
 from lingo_mi.validation.markdown import insert_into, table
 
 
-def predictions(found: dict) -> str:
+def predictions(results: dict) -> str:
     """The table of predicted milliseconds of a step, by cloud and card."""
-    rows = [(cloud, parts['step']) for cloud, parts in found.items() if 'step' in parts]
+    rows = [(cloud, parts['step']) for cloud, parts in results.items() if 'step' in parts]
 
     def cell(card):
         return lambda row: f'{1e3 * sum(seconds(kernel, card) for kernel in row[1]):.2f}'

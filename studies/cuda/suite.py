@@ -104,21 +104,21 @@ def run_tests(
     report : callable
         Called with a line for every file.
     """
-    run, known, now = f'sm_{sm}_noise' if noise else f'sm_{sm}', set(), _code(tests)
+    run, compiled_kernels, now = f'sm_{sm}_noise' if noise else f'sm_{sm}', set(), _code(tests)
     total, kernels = Outcome(), {}
 
     def cell(name):
         start = time.perf_counter()
         for case in run, ANY:
-            found = cells.get(case, name)
-            if found is not None and found['code'] == now and not found['outcome']['failed']:
-                outcome, compiled = Outcome(**found['outcome']), [Kernel(**kernel) for kernel in found['kernels']]
+            stored = cells.get(case, name)
+            if stored is not None and stored['code'] == now and not stored['outcome']['failed']:
+                outcome, compiled = Outcome(**stored['outcome']), [Kernel(**kernel) for kernel in stored['kernels']]
                 break
         else:
-            outcome, compiled, loads = _run_file(stand_in, tests, name, sm, noise, known)
-            kept = dict(outcome=vars(outcome), kernels=[asdict(kernel) for kernel in compiled], code=now)
-            cells.put(run if loads else ANY, name, kept)
-        known.update(kernel.name for kernel in compiled)  # spares the next files their assembling
+            outcome, compiled, loads = _run_file(stand_in, tests, name, sm, noise, compiled_kernels)
+            record = dict(outcome=vars(outcome), kernels=[asdict(kernel) for kernel in compiled], code=now)
+            cells.put(run if loads else ANY, name, record)
+        compiled_kernels.update(kernel.name for kernel in compiled)  # spares the next files their assembling
         return name, outcome, compiled, time.perf_counter() - start
 
     with ThreadPoolExecutor(WORKERS) as pool:
@@ -139,7 +139,7 @@ def _code(tests):
     return digest.hexdigest()
 
 
-def _run_file(stand_in, tests, name, sm, noise, known):
+def _run_file(stand_in, tests, name, sm, noise, compiled_kernels):
     """The outcome of a test file, its kernels beyond those known, and whether it loads any."""
     with tempfile.TemporaryDirectory() as folder:
         result, dump = Path(folder) / 'result.xml', Path(folder) / 'ptx'
@@ -164,7 +164,9 @@ def _run_file(stand_in, tests, name, sm, noise, known):
         if done.returncode not in (0, 5) and not outcome.failed:  # 5: there are no tests
             outcome.failed.append(f'{name}: exit code {done.returncode}')
         modules = sorted(dump.glob('*.ptx'))
-        kernels = [kernel for module in modules if module.stem not in known for kernel in assemble(module, sm, name)]
+        kernels = [
+            kernel for module in modules if module.stem not in compiled_kernels for kernel in assemble(module, sm, name)
+        ]
         return outcome, kernels, bool(modules)
 
 

@@ -74,10 +74,10 @@ def main() -> None:
     p.add_argument('checkpoint', type=Path, help='of a fit')
     args = p.parse_args()
     try:
-        found = of_a_step(args.program, str(args.checkpoint))
+        waits = of_a_step(args.program, str(args.checkpoint))
     except InputError as error:
         sys.exit(f'error: {error}')
-    print(table([('a step', lambda row: row[0]), ('calls', lambda row: f'{row[1]}')], found.items()))  # type: ignore[arg-type]
+    print(table([('a step', lambda row: row[0]), ('calls', lambda row: f'{row[1]}')], waits.items()))  # type: ignore[arg-type]
 
 
 if __name__ == '__main__':

@@ -72,12 +72,12 @@ def image(gaussians: Sequence, view: View, derivatives: bool) -> None:
     """Project a cloud into one view, and backpropagate."""
     if derivatives:
         dr.enable_grad(gaussians)
-    found = line_integrals(*gaussians, view=view, options=RenderOptions(FIT))
-    dr.eval(found)
+    result = line_integrals(*gaussians, view=view, options=RenderOptions(FIT))
+    dr.eval(result)
     if derivatives:
-        upstream = np.random.default_rng(1).normal(size=dr.width(found)).astype(np.float32)
-        dr.set_grad(found, uploaded(upstream))
-        dr.enqueue(dr.ADMode.Backward, found)
+        upstream = np.random.default_rng(1).normal(size=dr.width(result)).astype(np.float32)
+        dr.set_grad(result, uploaded(upstream))
+        dr.enqueue(dr.ADMode.Backward, result)
         dr.traverse(dr.ADMode.Backward)
         dr.eval([dr.grad(x) for x in gaussians])
     dr.sync_thread()

@@ -105,21 +105,21 @@ def measure(name: str, parameters: dict | None = None, method: Method = METHOD, 
         For an unknown name.
     """
     experiment = experiment_of(name)
-    scenes, found = {}, {}
+    scenes, results = {}, {}
     for kind, changes in dict(clean={}, ignore=dict(effects='ignore'), model=experiment.model).items():
-        given = (parameters or {}) | experiment.scene.get(kind, {})
-        key = tuple(sorted(given.items()))
+        values = (parameters or {}) | experiment.scene.get(kind, {})
+        key = tuple(sorted(values.items()))
         if key not in scenes:
-            scenes[key] = scans(name, given, seed)
+            scenes[key] = scans(name, values, seed)
         what, chosen = scenes[key]['clean' if kind == 'clean' else 'scan'], method.changed(**changes)
         fit = run(what, chosen, seed)
-        found[kind] = fit.volume(), dict(ms_per_iteration=pace(fit.history), seconds=fit.seconds)
+        results[kind] = fit.volume(), dict(ms_per_iteration=pace(fit.history), seconds=fit.seconds)
     first = next(iter(scenes.values()))  # of the clean scan
-    shape = np.min([volume.shape for volume, _ in found.values()], 0)
+    shape = np.min([volume.shape for volume, _ in results.values()], 0)
     truth = middle(first['truth'], shape)
     fits = {
         kind: quality(middle(volume, shape), truth) | times | dict(volume=middle(volume, shape))
-        for kind, (volume, times) in found.items()
+        for kind, (volume, times) in results.items()
     }
     return dict(
         title=experiment.title,

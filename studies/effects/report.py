@@ -16,7 +16,7 @@ from studies.effects.experiments import EXPERIMENTS, FITS
 TABLE = 'worth'  # its name in the document
 
 
-def write(found: dict[str, dict], folder: Path, figures: Path, document: Path | None = None) -> dict[str, dict]:
+def write(results: dict[str, dict], folder: Path, figures: Path, document: Path | None = None) -> dict[str, dict]:
     """Write effects.json and effects.md into `folder`, a picture of every experiment into `figures`, and the table into a
     document.
 
@@ -24,7 +24,7 @@ def write(found: dict[str, dict], folder: Path, figures: Path, document: Path | 
 
     Parameters
     ----------
-    found : dict[str, dict]
+    results : dict[str, dict]
         What `experiments.measure` gave, by the experiments' names; effects.json keeps what it holds of others, each with its own
         `provenance`.
     document : Path or None
@@ -32,17 +32,17 @@ def write(found: dict[str, dict], folder: Path, figures: Path, document: Path | 
     """
     for path in (folder, figures):
         path.mkdir(parents=True, exist_ok=True)
-    for name, result in found.items():
+    for name, result in results.items():
         draw(result, figures / f'{name}.png')
     numbers = {
         name: {k: v for k, v in result.items() if k not in ('truth', *FITS)}
         | {kind: {k: v for k, v in result[kind].items() if k != 'volume'} for kind in FITS}
         | dict(provenance=provenance())
-        for name, result in found.items()
+        for name, result in results.items()
     }
     path = folder / 'effects.json'
-    known = (read_object(path) if path.exists() else {}) | numbers
-    numbers = {name: known[name] for name in EXPERIMENTS if name in known}
+    stored = (read_object(path) if path.exists() else {}) | numbers
+    numbers = {name: stored[name] for name in EXPERIMENTS if name in stored}
     write_text(path, json.dumps(numbers, indent=1) + '\n')
     text = make_table(numbers)
     write_text(folder / 'effects.md', f'# What modelling an effect is worth\n\n{text}\n')

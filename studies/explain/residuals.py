@@ -122,14 +122,14 @@ def cloud_rows(
         yield stored.row(name, chosen, lambda: fitted(name, chosen))
 
 
-def report(found: list[Explained], folder: Path, title: str) -> str:
+def report(rows: list[Explained], folder: Path, title: str) -> str:
     """Write rms.json, rms.md with its provenance and residuals.png; returns the table."""
     folder.mkdir(parents=True, exist_ok=True)
-    text = table([(title, lambda r: r.name), ('held-out views, rms', lambda r: f'{r.rms:.5f}')], found)
-    write_text(folder / 'rms.json', json.dumps({r.name: r.rms for r in found}, indent=1) + '\n')
+    text = table([(title, lambda r: r.name), ('held-out views, rms', lambda r: f'{r.rms:.5f}')], rows)
+    write_text(folder / 'rms.json', json.dumps({r.name: r.rms for r in rows}, indent=1) + '\n')
     write_text(folder / 'rms.md', text + '\n')
     write_provenance(folder / 'rms.md')
-    _draw(found, folder / 'residuals.png')
+    _draw(rows, folder / 'residuals.png')
     return text
 
 
@@ -154,24 +154,24 @@ class _Stored:
         self.cells, self.table = CellFiles(folder, 'of', 'rms', 'view'), table
         self.scans = f'{dataset.train.digest()} {dataset.test.digest()}'
 
-    def row(self, name: str, made_with: dict, compute: Callable[[], Explained]) -> Explained:
+    def row(self, name: str, settings: dict, compute: Callable[[], Explained]) -> Explained:
         """The row of this name, computed unless it is stored and was made with these numbers or options."""
-        of, place = f'{self.scans} {json.dumps(made_with)}', name.replace(' ', '_')
-        found: dict[str, Any] | None = self.cells.get(self.table, place)
-        if found is None or found['of'] != of:
+        of, place = f'{self.scans} {json.dumps(settings)}', name.replace(' ', '_')
+        stored: dict[str, Any] | None = self.cells.get(self.table, place)
+        if stored is None or stored['of'] != of:
             row = compute()
-            found = dict(of=of, rms=row.rms, view=row.view.tolist())
-            self.cells.put(self.table, place, found)
-        return Explained(name, found['rms'], np.array(found['view'], np.float32))
+            stored = dict(of=of, rms=row.rms, view=row.view.tolist())
+            self.cells.put(self.table, place, stored)
+        return Explained(name, stored['rms'], np.array(stored['view'], np.float32))
 
 
 def _with(calibration, numbers, air):
     """A calibration with these numbers, and this air read beside the object, alone."""
-    found = calibration.found
+    result = calibration.found
     places = {k: v for k, v in numbers.items() if k[0] in 'uvy'}
-    response = None if found.response is None else found.response.changed(numbers)
+    response = None if result.response is None else result.response.changed(numbers)
     return replace(
-        calibration, air=air, found=replace(found, drift=Drift.of(found.drift.scan, places), response=response)
+        calibration, air=air, found=replace(result, drift=Drift.of(result.drift.scan, places), response=response)
     )
 
 
@@ -208,19 +208,19 @@ def _ideal(dataset):
     return Dataset(clean.subset(slice(0, n)), clean.subset(slice(n, None)))
 
 
-def _draw(found, path):
+def _draw(rows, path):
     """The differences in one held-out view, row by row of the table, on one scale."""
     from matplotlib.figure import Figure  # half a second that reconstructions need not wait for
 
-    columns = min(4, len(found))
-    lines = -(-len(found) // columns)
-    height, width = found[0].view.shape
+    columns = min(4, len(rows))
+    lines = -(-len(rows) // columns)
+    height, width = rows[0].view.shape
     flat = height < width / 8  # a row of a fan beam is drawn as a curve
     figure = Figure(
         figsize=(3.2 * columns, (1.8 if flat else 3.2 * height / width + 0.5) * lines), layout='constrained'
     )
-    limit = float(np.percentile(np.abs(found[0].view), 99))
-    for k, row in enumerate(found):
+    limit = float(np.percentile(np.abs(rows[0].view), 99))
+    for k, row in enumerate(rows):
         axes = figure.add_subplot(lines, columns, k + 1)
         if flat:
             axes.plot(row.view.mean(0), linewidth=0.8)

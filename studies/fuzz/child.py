@@ -22,15 +22,15 @@ from studies.fuzz.readers import case, reader, write
 def verdict(name: str, folder: Path, rng: Random) -> str:
     """What a reader makes of one case, whose files are written below `folder`."""
     index, file, content = case(name, rng)
-    read, found = reader(name)
+    read, samples = reader(name)
     home = folder / f'{name.replace(", ", "-").replace(" ", "-")}{index}'
     if not home.exists():
-        write(found[index], home)
+        write(samples[index], home)
     path = home / file
     original = path.read_bytes()
     path.write_bytes(content)
     try:
-        return outcome(lambda: read(home / found[index].target, rng))
+        return outcome(lambda: read(home / samples[index].target, rng))
     finally:
         path.write_bytes(original)
 
@@ -49,8 +49,8 @@ def outcome(call) -> str:
         return 'refused'
     except Exception as error:
         last = traceback.extract_tb(error.__traceback__)[-1]
-        said = ' '.join(str(error).split())[:200]
-        return f'{type(error).__name__} in {Path(last.filename).name}:{last.lineno}: {said}'
+        message = ' '.join(str(error).split())[:200]
+        return f'{type(error).__name__} in {Path(last.filename).name}:{last.lineno}: {message}'
 
 
 def limit_memory(more: int) -> None:
@@ -78,8 +78,8 @@ def main() -> None:
                 limited = True
             for number in range(int(first), int(last)):
                 answers.write(f'start {number}\n')
-                found = verdict(name, Path(folder), Random(f'{seed}/{name}/{number}'))
-                answers.write(f'end {number} {found}\n')
+                result = verdict(name, Path(folder), Random(f'{seed}/{name}/{number}'))
+                answers.write(f'end {number} {result}\n')
 
 
 if __name__ == '__main__':

@@ -119,9 +119,9 @@ def _rays(rays: Any) -> None:
 def samples() -> dict[str, tuple[Callable[[Path, Random], None], list[Sample]]]:
     """Every reader but the scenes': its function and its good files, by name."""
     groups = ((_volume, corpus.volumes()), (_scan, corpus.scans()))
-    out = {name: (read, found) for read, group in groups for name, found in group.items()}
+    out = {name: (read, files) for read, group in groups for name, files in group.items()}
     reads = dict(ply=_ply, exr=_exr, poses=_poses, checkpoint=_checkpoint)
-    return out | {name: (reads[name], found) for name, found in corpus.others().items()}
+    return out | {name: (reads[name], files) for name, files in corpus.others().items()}
 
 
 @cache
@@ -143,9 +143,9 @@ def reader(name: str) -> tuple[Callable[[Path, Random], None], list[Sample]]:
 
 def case(name: str, rng: Random) -> tuple[int, str, bytes]:
     """Which sample of a reader, which of its files is mutated, and what it holds then."""
-    found = reader(name)[1]
-    index = rng.randrange(len(found))
-    files = found[index].files
+    sample = reader(name)[1]
+    index = rng.randrange(len(sample))
+    files = sample[index].files
     # The first file is what says where the others are.
     file = rng.choice([next(iter(files)), *files])
     return index, file, mutations.mutated(files[file], file, rng)

@@ -68,18 +68,18 @@ def main() -> None:
     if document:
         check_places(document, ['growth'])
     args.out.mkdir(parents=True, exist_ok=True)
-    stored, made = args.out / 'growth.json', dict(commit=commit(), machine=machine())
+    stored, provenance = args.out / 'growth.json', dict(commit=commit(), machine=machine())
     with locked(args.out), Progress('Stages', len(DEPENDS)) as bar:
 
-        def after(found, others):
-            write_text(stored, json.dumps([row | made for row in found + others], indent=1) + '\n')
-            bar.update(len({row['stage'] for row in found}), last=found[-1]['stage'])
+        def after(rows, others):
+            write_text(stored, json.dumps([row | provenance for row in rows + others], indent=1) + '\n')
+            bar.update(len({row['stage'] for row in rows}), last=rows[-1]['stage'])
 
-        found = sweep(args.large, read(stored), after)
-    text = exponents(found)
+        rows = sweep(args.large, read(stored), after)
+    text = exponents(rows)
     write_text(args.out / 'growth.md', text + '\n')
     write_provenance(args.out / 'growth.md')
-    draw(found, figures / 'growth.png')
+    draw(rows, figures / 'growth.png')
     if document:
         insert_into(document, {'growth': text})
     print(text)

@@ -10,17 +10,17 @@ from studies.growth.stages import AXES, DEPENDS
 from studies.growth.sweep import exponent
 
 
-def rows_of(found: list[dict], stage: str, axis: str) -> list[dict]:
+def rows_of(rows: list[dict], stage: str, axis: str) -> list[dict]:
     """The measurements of a stage along an axis, by number."""
-    return sorted((r for r in found if (r['stage'], r['axis']) == (stage, axis)), key=lambda row: row['number'])
+    return sorted((r for r in rows if (r['stage'], r['axis']) == (stage, axis)), key=lambda row: row['number'])
 
 
-def exponents(found: list[dict]) -> str:
+def exponents(measured: list[dict]) -> str:
     """Markdown: the exponent of CPU time by stage and axis; – where nothing depends."""
 
     def cell(axis):
         def text(row):
-            rows = rows_of(found, row['stage'], axis)
+            rows = rows_of(measured, row['stage'], axis)
             return f'{exponent(rows, "seconds"):.2f}' if len(rows) > 1 else '–'
 
         return text
@@ -29,7 +29,7 @@ def exponents(found: list[dict]) -> str:
     return table(columns, [dict(stage=stage) for stage in DEPENDS])
 
 
-def draw(found: list[dict], path: Path) -> None:
+def draw(measured: list[dict], path: Path) -> None:
     """CPU seconds (above) and peak memory (below) of every stage against voxels, pixels, views and Gaussians."""
     from matplotlib.figure import Figure
 
@@ -37,7 +37,7 @@ def draw(found: list[dict], path: Path) -> None:
     axes = fig.subplots(2, len(AXES), sharex='col', sharey='row')
     for column, axis in enumerate(AXES):
         for i, stage in enumerate(DEPENDS):
-            rows = rows_of(found, stage, axis)
+            rows = rows_of(measured, stage, axis)
             if len(rows) < 2:
                 continue
             numbers = [row['number'] for row in rows]

@@ -55,14 +55,14 @@ def sweep(large: bool, stored: list[dict], after_each: Callable[[list[dict], lis
     InputError
         If a stage fails.
     """
-    found: list[dict] = []
+    rows: list[dict] = []
     for stage in DEPENDS:
         wanted = [(axis, number(axis, value)) for axis, value in planned(stage, large)]
-        kept = [row for row in stored if row['stage'] == stage and (row['axis'], row['number']) in wanted]
-        found += kept if len(kept) == len(wanted) else _measured(stage, planned(stage, large))
-        new = [(row['stage'], row['axis'], row['number']) for row in found]
-        after_each(found, [row for row in stored if (row['stage'], row['axis'], row['number']) not in new])
-    return found
+        reused = [row for row in stored if row['stage'] == stage and (row['axis'], row['number']) in wanted]
+        rows += reused if len(reused) == len(wanted) else _measured(stage, planned(stage, large))
+        new = [(row['stage'], row['axis'], row['number']) for row in rows]
+        after_each(rows, [row for row in stored if (row['stage'], row['axis'], row['number']) not in new])
+    return rows
 
 
 def _measured(stage: str, plan: list[tuple[str, int]]) -> list[dict]:

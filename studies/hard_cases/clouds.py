@@ -164,7 +164,7 @@ def _densities():
 def _places():
     ahead = -np.array([np.cos(np.radians(33)), np.sin(np.radians(33)), 0])  # from the source to the panel's middle
     side = np.array([-ahead[1], ahead[0], 0])
-    one = dict(scale=[[0.2, 0.16, 0.26]], rotation=[[0.1, 0.4, -0.3, 0.8]], density=[0.7])
+    gaussian = dict(scale=[[0.2, 0.16, 0.26]], rotation=[[0.1, 0.4, -0.3, 0.8]], density=[0.7])
     rays, shape = scanner()
     source = np.float32(rays.source[0])
     places = {
@@ -185,7 +185,7 @@ def _places():
         'from source to panel': (0 * ahead, 6),
     }
     for name, (centre, size) in places.items():
-        cloud = Cloud([centre], size * np.array(one['scale']), one['rotation'], one['density'])
+        cloud = Cloud([centre], size * np.array(gaussian['scale']), gaussian['rotation'], gaussian['density'])
         case = ViewCase(name, cloud, rays, shape)
         if name == 'centre outside the fan, reaching in':
             case = replace(case, image=2e-6, note='a far tail only')
@@ -193,7 +193,7 @@ def _places():
     rays, shape = scanner('parallel')
     for name in ('centre outside the fan, reaching in', 'behind the source', 'centre on the panel', 'behind the panel'):
         centre, size = places[name]
-        cloud = Cloud([centre], size * np.array(one['scale']), one['rotation'], one['density'])
+        cloud = Cloud([centre], size * np.array(gaussian['scale']), gaussian['rotation'], gaussian['density'])
         yield ViewCase(f'{name}, parallel: never cut'.replace('the fan', 'the beam'), cloud, rays, shape)
     rays, shape = scanner(shape=(25, 33))
     turn = Rotation.from_euler('z', 33 + 1e-4, degrees=True).as_quat()[None]

@@ -153,9 +153,9 @@ def errors(
     """
     thickness = np.sqrt(2 * np.pi) * cloud.scale.min(1) if thickness is None else thickness
     floor = FLOOR * np.abs(cloud.density) * thickness + TINY
-    found, truth = natural(cloud, gradients), natural(cloud, expected_gradients)
+    derivatives, truth = natural(cloud, gradients), natural(cloud, expected_gradients)
     size = np.maximum(np.linalg.norm(np.concatenate(list(truth.values()), 1), axis=1), floor)
-    worst = {name: float((np.linalg.norm(found[name] - truth[name], axis=1) / size).max()) for name in PARAMETERS}
+    worst = {name: float((np.linalg.norm(derivatives[name] - truth[name], axis=1) / size).max()) for name in PARAMETERS}
     norm = max(np.linalg.norm(expected), floor.max())
     return Result(float(np.linalg.norm(image - expected) / norm), worst)
 
@@ -171,8 +171,8 @@ def measure(case: ViewCase | VoxelCase | ScanCase) -> Result:
             result = Result(refused=str(error))
         except FloatingPointError as error:
             result = Result(failed=str(error))
-    said = [str(w.message) for w in caught if issubclass(w.category, AccuracyWarning)]
-    return replace(result, warned=said[0] if said else '')
+    messages = [str(w.message) for w in caught if issubclass(w.category, AccuracyWarning)]
+    return replace(result, warned=messages[0] if messages else '')
 
 
 def _measure_view(case):
@@ -194,7 +194,7 @@ def _expected_image(cloud, pose):
     those do not depend on the others, of a large cloud the MOST_COMPARED that give most to the image."""
     if len(cloud) <= MOST_COMPARED:
         return oracle.line_integrals(cloud, pose), np.arange(len(cloud))
-    given = np.zeros(len(cloud))
+    total = np.zeros(len(cloud))
     turn = Rotation.from_quat(cloud.rotation).inv()
     out = []
     for start, direction in zip(*pose.rays()):
@@ -205,8 +205,8 @@ def _expected_image(cloud, pose):
         peak = cloud.density * np.sqrt(2 * np.pi / dd) * np.linalg.norm(direction)
         each = peak * np.exp(-0.5 * ((w - m[:, None] * d) ** 2).sum(1)) * share
         out.append(each.sum())
-        given += each
-    return np.array(out), np.argsort(-given)[:MOST_COMPARED]
+        total += each
+    return np.array(out), np.argsort(-total)[:MOST_COMPARED]
 
 
 def _measure_voxels(case):

@@ -46,10 +46,10 @@ class Stored:
 
     def misses(self, cases: Sequence) -> dict[str, str]:
         """What cases show that they may not, in words, by name; a case that was not measured misses nothing."""
-        found = {
+        misses = {
             case.name: miss(case, self.results[case.name], self.variant) for case in cases if case.name in self.results
         }
-        return {name: wrong for name, wrong in found.items() if wrong}
+        return {name: wrong for name, wrong in misses.items() if wrong}
 
 
 def store(path: Path, variant: str, results: Sequence[tuple]) -> None:

@@ -90,10 +90,10 @@ class Study:
         for case in cases:
             for setting in settings:
                 if self.get(case, setting) is None:
-                    found = self._compute(case, setting)
-                    last, best = found['psnr_3d'][-1], max(found['psnr_3d'])
-                    self.cells.put(self.name(case), setting, found)
-                    say(f'{case}, {setting}: {last:.2f} dB after {found["steps"][-1]} steps, at best {best:.2f}')
+                    cell = self._compute(case, setting)
+                    last, best = cell['psnr_3d'][-1], max(cell['psnr_3d'])
+                    self.cells.put(self.name(case), setting, cell)
+                    say(f'{case}, {setting}: {last:.2f} dB after {cell["steps"][-1]} steps, at best {best:.2f}')
 
     def _compute(self, case: Case, setting: str) -> dict:
         scan, truth = self.dataset(case)
@@ -124,18 +124,18 @@ class Study:
     def table(self, cases: Iterable[Case]) -> str:
         """The Markdown table of the cells that are there, a row a case: dB of the volume (after so many steps)."""
         cells = {case: {name: cell for name in SETTINGS if (cell := self.get(case, name))} for case in cases}
-        weighed = any(WEIGHTED in found for found in cells.values())
+        weighed = any(WEIGHTED in numbers for numbers in cells.values())
         heads = ['all steps', 'best of all steps', '**stopped**', 'behind the best']
         heads += ['weights 1 / s, all steps', 'weights 1 / s, best'] * weighed
         lines = [f'| object | scanned | photons | {" | ".join(heads)} |', '|---|---:|---:|' + '---:|' * len(heads)]
-        for case, found in cells.items():
-            if not found:
+        for case, numbers in cells.items():
+            if not numbers:
                 continue
-            equal = found.get('equal')
+            equal = numbers.get('equal')
             row = [_shown(*of(equal)) if equal else '–' for of in (_last, _best)]
-            row += _stopped(found.get('stopped'), _best(equal)[0] if equal else None)
+            row += _stopped(numbers.get('stopped'), _best(equal)[0] if equal else None)
             if weighed:
-                row += [_shown(*of(found[WEIGHTED])) if WEIGHTED in found else '–' for of in (_last, _best)]
+                row += [_shown(*of(numbers[WEIGHTED])) if WEIGHTED in numbers else '–' for of in (_last, _best)]
             lines.append(f'| {case.object} | x{case.finer} | {case.photons:g} | {" | ".join(row)} |')
         return '\n'.join(lines)
 

@@ -117,12 +117,12 @@ class Method:
             return self.volume(scan), {}
         value = self.values[0]
         if len(self.values) > 1:
-            kept, held_out = split_views(scan, 5)
-            value = min(self.values, key=lambda value: self._miss(kept, value, held_out))
+            train, held_out = split_views(scan, 5)
+            value = min(self.values, key=lambda value: self._miss(train, value, held_out))
         return self.volume(scan, value), {self.setting: value}
 
-    def _miss(self, kept: Scan, value: float, held_out: Scan) -> float:
-        volume = self.volume(kept, value)
+    def _miss(self, train: Scan, value: float, held_out: Scan) -> float:
+        volume = self.volume(train, value)
         return _wrong(volume, held_out) if np.isfinite(volume).all() else np.inf  # a peer may diverge
 
 
@@ -154,8 +154,8 @@ def method_of(name: str) -> Method:
     kind, _, value = name.partition(':')
     method = METHODS.get(kind)
     if method is None or value and not method.setting:
-        known = [*METHODS, *(f'{name}:{method.setting.upper()}' for name, method in METHODS.items() if method.setting)]
-        raise InputError(f'--methods {name}: is unknown; use some of {", ".join(known)}')
+        names = [*METHODS, *(f'{name}:{method.setting.upper()}' for name, method in METHODS.items() if method.setting)]
+        raise InputError(f'--methods {name}: is unknown; use some of {", ".join(names)}')
     if not value:
         return method
     number = parse(f'--methods {name}', value, 0.0)
@@ -172,18 +172,18 @@ def installed(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
     InputError
         If none can.
     """
-    found = []
+    available = []
     for name in names:
         load, what = NEEDS.get(name.partition(':')[0], (None, ''))
         try:
             if load:
                 load()
-            found.append(name)
+            available.append(name)
         except (ImportError, AttributeError):
             say(f'{name}: left out, it needs {what}')
-    if not found:
+    if not available:
         raise InputError('none of the --methods is installed')
-    return found
+    return available
 
 
 class Study:
@@ -214,15 +214,15 @@ class Study:
             for method in methods:
                 if self.get(count, method) is None:
                     try:
-                        found = self._compute(chosen, method)
+                        cell = self._compute(chosen, method)
                     except InputError as error:
                         say(f'{count} views, {method}: left out: {error}')
                         continue
-                    self.cells.put(_case(count), _file(method), found)
-                    said = ', '.join([method, *(f'{name} {value:g}' for name, value in found['settings'].items())])
+                    self.cells.put(_case(count), _file(method), cell)
+                    text = ', '.join([method, *(f'{name} {value:g}' for name, value in cell['settings'].items())])
                     say(
-                        f'{count} views, {said}: rms {found["held_out_rms"]:.4f}, {found["psnr_3d"]:.2f} dB, '
-                        f'{found["seconds"]:.0f} s'
+                        f'{count} views, {text}: rms {cell["held_out_rms"]:.4f}, {cell["psnr_3d"]:.2f} dB, '
+                        f'{cell["seconds"]:.0f} s'
                     )
 
     def _require_same_scan(self) -> None:
@@ -277,9 +277,9 @@ class Study:
         """The Markdown table of the cells that are there, a row a method of every number of views."""
         lines = ['| views | method | held-out rms | volume, dB | s | processor s |', '|---:|---|---:|---:|---:|---:|']
         for count in views:
-            found = {method: cell for method in methods if (cell := self.get(count, method))}
-            least = min((cell['held_out_rms'] for cell in found.values()), default=0.0)
-            for method, cell in found.items():
+            cells = {method: cell for method in methods if (cell := self.get(count, method))}
+            least = min((cell['held_out_rms'] for cell in cells.values()), default=0.0)
+            for method, cell in cells.items():
                 rms = f'{cell["held_out_rms"]:.4f}'
                 lines.append(
                     f'| {count} | {method_of(method).label} | {f"**{rms}**" if cell["held_out_rms"] == least else rms} '

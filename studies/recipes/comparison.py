@@ -109,16 +109,16 @@ class Comparison:
         except (InputError, OSError):  # the fit will say so
             return
         path = self.folder / 'scenes.json'
-        known = read_object(path) if path.exists() else {}
-        if folder.exists() and known.get(folder.name, digest) != digest:
+        stored = read_object(path) if path.exists() else {}
+        if folder.exists() and stored.get(folder.name, digest) != digest:
             raise InputError(f'{folder}: has the fit of another scene of this name; choose another --out, or remove it')
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_text(path, json.dumps(known | {folder.name: digest}, indent=1) + '\n')
+        write_text(path, json.dumps(stored | {folder.name: digest}, indent=1) + '\n')
 
     def plan(self, scene: PathLike | str, method: str) -> tuple[Path, list[str]]:
         """The folder of a fit, and the command that fills it."""
-        name, _, own = method.partition(':')
-        changes = [*self.changes, *changes_of(own)]
+        name, _, setting = method.partition(':')
+        changes = [*self.changes, *changes_of(setting)]
         if name != 'fast' and not any(change.startswith('iterations=') for change in changes):
             changes.append(f'iterations={self.iterations}')
         parts = [Path(scene).stem, str(self.views), name, *changes]

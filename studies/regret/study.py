@@ -97,9 +97,9 @@ class Study:
         for case in cases:
             for setting in [*VOXELS, BEST, *((*CLOUDS, BEST_CLOUD) if clouds else ())]:
                 if self.get(case, setting) is None:
-                    found = self._compute(case, setting)
-                    self.cells.put(self.name(case), setting, found)
-                    say(f'{case}, {setting}: {found["psnr_3d"]:.2f} dB, {found["seconds"]:.1f} s')
+                    cell = self._compute(case, setting)
+                    self.cells.put(self.name(case), setting, cell)
+                    say(f'{case}, {setting}: {cell["psnr_3d"]:.2f} dB, {cell["seconds"]:.1f} s')
 
     def _compute(self, case: Case, setting: str) -> dict:
         dataset = self.dataset(case)
@@ -108,12 +108,12 @@ class Study:
             self._cloud(case)  # not in this setting's time, but in its sum
         began, extra = time.process_time(), {}
         if setting in (BEST, BEST_CLOUD):
-            found = run_algorithm(dataset.train, Best(cloud=setting == BEST_CLOUD), fit=fit_cloud)
-            assert isinstance(found, Chosen) and found.error is not None
-            volume = found.volume
+            result = run_algorithm(dataset.train, Best(cloud=setting == BEST_CLOUD), fit=fit_cloud)
+            assert isinstance(result, Chosen) and result.error is not None
+            volume = result.volume
             wrong = np.sqrt(gaussian_filter((volume - dataset.volume) ** 2, SPREAD))
             extra = dict(
-                plan=found.record(), error_map=float(np.asarray(spearmanr(found.error.ravel(), wrong.ravel()))[0])
+                plan=result.record(), error_map=float(np.asarray(spearmanr(result.error.ravel(), wrong.ravel()))[0])
             )
         else:
             volume = self._volume(case, dataset.train, setting)
@@ -186,7 +186,7 @@ class Study:
             chosen, with_cloud = self.get(case, BEST), self.get(case, BEST_CLOUD)
             if chosen is None:
                 continue
-            fixed = {name: found for name in names if (found := self.get(case, name))}
+            fixed = {name: cell for name in names if (cell := self.get(case, name))}
             photons = f'{case.photons:g}' if case.photons else 'measured' if case.object in MEASURED else 'no noise'
             row = [case.object, f'x{case.finer}', str(case.views), photons]
             row += [_cell(chosen), _regret(chosen, [fixed[name] for name in VOXELS if name in fixed])]
@@ -197,9 +197,9 @@ class Study:
         return '\n'.join(lines)
 
 
-def _cell(found: dict | None) -> str:
-    return f'{found["psnr_3d"]:.2f} ({found["seconds"]:.0f} s)' if found else '–'
+def _cell(cell: dict | None) -> str:
+    return f'{cell["psnr_3d"]:.2f} ({cell["seconds"]:.0f} s)' if cell else '–'
 
 
-def _regret(found: dict | None, fixed: Iterable[dict]) -> str:
-    return f'{max((other["psnr_3d"] for other in fixed), default=np.nan) - found["psnr_3d"]:+.2f}' if found else '–'
+def _regret(cell: dict | None, fixed: Iterable[dict]) -> str:
+    return f'{max((other["psnr_3d"] for other in fixed), default=np.nan) - cell["psnr_3d"]:+.2f}' if cell else '–'

@@ -108,11 +108,11 @@ def compare(work: Workload, list_of_methods: list[Method], sizes: Sizes) -> list
     image, gradients = work.truth
     for m in list_of_methods:  # the first calls, which compile
         row: dict = dict(name=m.name)
-        found, row['memory_mb'] = peak_memory(m.image)
-        row['image'], row['image_max'] = deviation(np.array(found), image)
+        result, row['memory_mb'] = peak_memory(m.image)
+        row['image'], row['image_max'] = deviation(np.array(result), image)
         if m.gradients:
-            found, row['memory_gradients_mb'] = peak_memory(m.gradients)
-            for key, by in zip(NAMES, found):
+            result, row['memory_gradients_mb'] = peak_memory(m.gradients)
+            for key, by in zip(NAMES, result):
                 row[key], row[f'{key}_max'] = deviation(np.array(by).T, gradients[key])
         rows.append(row)
     take_turns(list_of_methods, sizes)
@@ -121,10 +121,10 @@ def compare(work: Workload, list_of_methods: list[Method], sizes: Sizes) -> list
     return rows
 
 
-def deviation(found: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
+def deviation(result: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
     """Relative L2 and maximum error."""
-    found, expected = np.ravel(np.asarray(found, float)), np.ravel(expected)
-    error = found - expected
+    result, expected = np.ravel(np.asarray(result, float)), np.ravel(expected)
+    error = result - expected
     return (float(np.linalg.norm(error) / np.linalg.norm(expected)), float(abs(error).max() / abs(expected).max()))
 
 

@@ -50,15 +50,15 @@ def samples(sizes: Sizes) -> list[dict]:
         options = FIELD.changed(field_samples=n)
         _image(options, geometry, state)  # compiles
         times = [_timed(lambda options=options: _image(options, geometry, state)) for _ in range(3)]
-        found, seconds = times[0][0], float(np.median([t for _, t in times]))
+        image, seconds = times[0][0], float(np.median([t for _, t in times]))
         at_random = deviation(_image(options, geometry, state, np.random.default_rng(0)), expected)[0]
-        rows.append(_row(f'{n}', found, expected, seconds, random=at_random))
+        rows.append(_row(f'{n}', image, expected, seconds, random=at_random))
     for n in sizes.grids:
         voxels = geometry.on(Grid(n, 256 / n))
         volume, sampling = _timed(lambda voxels=voxels: FieldModel(FIELD, geometry, 1.0).volume(state, voxels.grid))
-        found = grid.project_volume(volume, voxels)
+        image = grid.project_volume(volume, voxels)
         _, seconds = _timed(lambda volume=volume, voxels=voxels: grid.project_volume(volume, voxels))
-        rows.append(_row(f'voxels, {n}³', found[0].ravel(), expected, seconds, sampling=1e3 * sampling))
+        rows.append(_row(f'voxels, {n}³', image[0].ravel(), expected, seconds, sampling=1e3 * sampling))
     return rows
 
 
@@ -88,13 +88,13 @@ def _image(
 def _timed(work):
     dr.sync_thread()
     began = time.process_time()
-    found = work()
+    result = work()
     dr.sync_thread()
-    return found, time.process_time() - began
+    return result, time.process_time() - began
 
 
-def _row(name: str, found: np.ndarray, expected: np.ndarray, seconds: float, **more: float) -> dict:
-    l2, largest = deviation(found, expected)
+def _row(name: str, image: np.ndarray, expected: np.ndarray, seconds: float, **more: float) -> dict:
+    l2, largest = deviation(image, expected)
     return dict(name=name, image=l2, image_max=largest, us_per_ray=1e6 * seconds / len(expected)) | more
 
 

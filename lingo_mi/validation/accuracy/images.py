@@ -47,23 +47,23 @@ def footprint(work: Workload, sizes: Sizes) -> list[dict]:
 
 def methods(work: Workload, sizes: Sizes) -> list[dict]:
     """The splat, the closed form on every ray in three precisions, grids walked exactly and marched."""
-    found = [by_integrator(f'splat, {e:g} σ', work, extent=e) for e in (2.0, 3.0, 4.0, EXTENT, 7.0)]
-    found.append(by_integrator('splat, affine, 7 σ', work, extent=7.0, footprint='affine'))
+    compared = [by_integrator(f'splat, {e:g} σ', work, extent=e) for e in (2.0, 3.0, 4.0, EXTENT, 7.0)]
+    compared.append(by_integrator('splat, affine, 7 σ', work, extent=7.0, footprint='affine'))
     for p in ('float32', 'compensated', 'float64'):
 
         def per_ray(centre, scale, rotation, density, p=p):
             return alternatives.per_ray(centre, scale, rotation, density, work.view, p)
 
-        found.append(by_function(f'every ray, {p}', work, per_ray, p != 'compensated'))
+        compared.append(by_function(f'every ray, {p}', work, per_ray, p != 'compensated'))
     for n in sizes.grids:
-        found.append(by_function(f'grid {n}³, exact walk', work, lambda *x, n=n: _through_grid(work, x, n)))
-        found += [
+        compared.append(by_function(f'grid {n}³, exact walk', work, lambda *x, n=n: _through_grid(work, x, n)))
+        compared += [
             by_function(
                 f'grid {n}³, steps of {step:g} voxel', work, lambda *x, n=n, s=step: _through_grid(work, x, n, s)
             )
             for step in (1.0, 0.5)
         ]
-    return compare(work, found, sizes)
+    return compare(work, compared, sizes)
 
 
 def _through_grid(work: Workload, gaussians, n: int, step: float | None = None):
@@ -83,10 +83,12 @@ def _through_grid(work: Workload, gaussians, n: int, step: float | None = None):
 
 def marching(work: Workload, sizes: Sizes) -> list[dict]:
     """Mitsuba's tree over `ellipsoids`, and how many rays it gets wrong by more than 1e-3 of the image's maximum."""
-    found = [by_integrator(f'splat, {EXTENT:g} σ', work, extent=EXTENT)] + [by_tree(work, EXTENT, e) for e in EPSILONS]
-    rows = compare(work, found, sizes)
+    compared = [by_integrator(f'splat, {EXTENT:g} σ', work, extent=EXTENT)] + [
+        by_tree(work, EXTENT, e) for e in EPSILONS
+    ]
+    rows = compare(work, compared, sizes)
     image = work.truth[0].ravel()
-    for m, row in zip(found, rows):
+    for m, row in zip(compared, rows):
         row['wrong_rays'] = float((abs(np.array(m.image()) - image) > 1e-3 * image.max()).mean())
     return rows
 
@@ -130,12 +132,12 @@ def pixel(sizes: Sizes) -> list[dict]:
 
 def teams(work: Workload, sizes: Sizes) -> list[dict]:
     """Into how many shares the work is cut, in parts of the usual number, and how many lanes work on one."""
-    found = [
+    compared = [
         by_integrator(f'{factor:g}', work, sharing=SHARING.scaled(factor), extent=EXTENT)
         for factor in (0.25, 0.5, 1, 2, 4, 16)
     ]
     for lanes in (4, 16):
         factor = SHARING.lanes / lanes
         sharing = replace(SHARING.scaled(factor), lanes=lanes)
-        found.append(by_integrator(f'{factor:g}, of {lanes} lanes', work, sharing=sharing, extent=EXTENT))
-    return compare(work, found, sizes)
+        compared.append(by_integrator(f'{factor:g}, of {lanes} lanes', work, sharing=sharing, extent=EXTENT))
+    return compare(work, compared, sizes)

@@ -12,26 +12,26 @@ from lingo_mi.validation.closed_form import NAMES
 RED, BLUE, GREEN, ORANGE, GREY, PURPLE = 'tab:red', 'tab:blue', 'tab:green', 'tab:orange', 'tab:gray', 'tab:purple'
 
 
-def draw(found: dict, folder: Path) -> None:
+def draw(results: dict, folder: Path) -> None:
     """Write the plots into a folder: pareto.png, scaling.png, fits.png."""
     for name, plot, size in (('pareto', _pareto, (11, 5)), ('scaling', _scaling, (13, 6)), ('fits', _fits, (11, 4.5))):
-        _save(folder / f'{name}.png', plot, found, size)
+        _save(folder / f'{name}.png', plot, results, size)
 
 
-def _save(path, plot, found, size):
+def _save(path, plot, results, size):
     from matplotlib import rc_context  # half a second that measuring need not wait for
     from matplotlib.figure import Figure
 
     with rc_context(STYLE):
         fig = Figure(figsize=size, layout='constrained')
-        plot(fig, found)
+        plot(fig, results)
         with replacing(path) as temporary:
             fig.savefig(temporary, dpi=90)
 
 
-def _pareto(fig, found):
+def _pareto(fig, results):
     """Error against time, of images and of derivatives."""
-    methods = found['methods']
+    methods = results['methods']
 
     def of(start, part=''):
         return [r for r in methods if r['name'].startswith(start) and part in r['name']]
@@ -46,7 +46,7 @@ def _pareto(fig, found):
         ('every Gaussian on every ray', of('every ray', 'float'), GREEN, '^', last),
         ('grid, exact walk', of('grid', 'exact'), ORANGE, 'D--', lambda r: r['name'].split()[1][:-1]),
         ('grid, steps of 1 voxel', of('grid', 'steps of 1'), GREY, 'x:', None),
-        ("Mitsuba's tree, best epsilon", [min(found['marching'][1:], key=lambda r: r['image'])], PURPLE, 'v', None),
+        ("Mitsuba's tree, best epsilon", [min(results['marching'][1:], key=lambda r: r['image'])], PURPLE, 'v', None),
     ]
     left, right = fig.subplots(1, 2)
     for axis, time, error, title in (
@@ -75,7 +75,7 @@ def _worst(row) -> float:
     return max(row[key] for key in NAMES)
 
 
-def _scaling(fig, found):
+def _scaling(fig, results):
     """Time a pair, of calls and of their kernels alone, and memory, in four sweeps."""
     sweeps = dict(
         pairs=('pairs', 'pairs of a pixel and a Gaussian'),
@@ -85,7 +85,7 @@ def _scaling(fig, found):
     )
     axes = fig.subplots(2, len(sweeps), sharey='row')
     for column, (sweep, (along, label)) in zip(axes.T, sweeps.items()):
-        rows = found['scaling'][sweep]
+        rows = results['scaling'][sweep]
         x = [r[along] for r in rows]
         for key, memory, colour, name in (
             ('forward', 'memory_mb', BLUE, 'forward'),
@@ -104,11 +104,11 @@ def _scaling(fig, found):
     axes[0, 0].legend(fontsize=8)
 
 
-def _fits(fig, found):
+def _fits(fig, results):
     """Quality against seconds while fits run, and of initial clouds."""
-    first = found['fits'][0]  # the others are variations of the same
+    first = results['fits'][0]  # the others are variations of the same
     alike = 'extent', 'side', 'pixels', 'asked', 'values_per_gaussian'
-    runs = [r for r in found['fits'] if all(r[key] == first[key] for key in alike)]
+    runs = [r for r in results['fits'] if all(r[key] == first[key] for key in alike)]
     most = max(r['iterations'] for r in runs)
     colours = dict(fast=GREEN, lingo=BLUE, r2=RED)
     axes = fig.subplots(1, 2)
@@ -122,8 +122,8 @@ def _fits(fig, found):
                 color=colours[r['name']],
                 label=f'{r["name"]}, up to {most} iterations' if r['iterations'] == most else None,
             )
-        for name, marker in zip(dict.fromkeys(r['name'] for r in found['initialisations']), 'sD^'):
-            rows = [r for r in found['initialisations'] if r['name'] == name]
+        for name, marker in zip(dict.fromkeys(r['name'] for r in results['initialisations']), 'sD^'):
+            rows = [r for r in results['initialisations'] if r['name'] == name]
             axis.semilogx(
                 [r['seconds'] for r in rows],
                 [r[key] for r in rows],

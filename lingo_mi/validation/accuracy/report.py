@@ -12,7 +12,7 @@ from lingo_mi.validation.markdown import insert_into
 from lingo_mi.validation.provenance import write_provenance
 
 
-def write(found: dict, folder: Path, figures: Path, document: Path | None = None, beside: dict | None = None) -> None:
+def write(results: dict, folder: Path, figures: Path, document: Path | None = None, beside: dict | None = None) -> None:
     """Write accuracy.json and accuracy.md into `folder`, the plots into `figures`, and the tables SHOWN into a document.
 
     Of presets alone there is one table and no plot.
@@ -26,15 +26,15 @@ def write(found: dict, folder: Path, figures: Path, document: Path | None = None
     beside : dict or None
         Another variant's presets, `tables.read_presets`.
     """
-    tables = make_tables(found, beside)
+    tables = make_tables(results, beside)
     folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / 'accuracy.json', json.dumps(found, indent=1) + '\n')
+    write_text(folder / 'accuracy.json', json.dumps(results, indent=1) + '\n')
     text = '\n\n'.join(f'## {TITLES[name]}\n\n{table}' for name, table in tables.items())
     write_text(folder / 'accuracy.md', f'# Accuracy against time\n\n{text}\n')
     write_provenance(folder / 'accuracy.md')
-    if 'methods' in found:
+    if 'methods' in results:
         figures.mkdir(parents=True, exist_ok=True)
-        draw(found, figures)
+        draw(results, figures)
     if document:
         insert_into(document, {name: table for name, table in tables.items() if name in SHOWN})
         write_provenance(document)

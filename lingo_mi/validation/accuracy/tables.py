@@ -32,7 +32,7 @@ TITLES = dict(
 SHOWN = 'conditions', 'presets'  # what the page of the documentation shows; it links to the others as data
 
 
-def make_tables(found: dict, beside: dict | None = None) -> dict[str, str]:
+def make_tables(results: dict, beside: dict | None = None) -> dict[str, str]:
     """Markdown tables by name, those of TITLES; of presets alone, their own.
 
     Parameters
@@ -40,8 +40,8 @@ def make_tables(found: dict, beside: dict | None = None) -> dict[str, str]:
     beside : dict or None
         Another variant's presets, `read_presets`, whose errors are shown beside.
     """
-    presets = preset_table(found, beside)
-    if 'methods' not in found:
+    presets = preset_table(results, beside)
+    if 'methods' not in results:
         return dict(presets=presets)
     first = dict(
         cutoff='cut-off, σ',
@@ -51,17 +51,17 @@ def make_tables(found: dict, beside: dict | None = None) -> dict[str, str]:
         pixel='rays a pixel',
         teams='shares, of the usual number',
     )
-    tables = {name: table(_COMPARE, found[name], title) for name, title in first.items()}
+    tables = {name: table(_COMPARE, results[name], title) for name, title in first.items()}
     wrong = ('wrong rays', lambda r: f'{100 * r["wrong_rays"]:.2g} %')
-    tables['marching'] = table([_COMPARE[0], wrong, *_COMPARE[1:]], found['marching'], first['marching'])
-    tables['conditions'] = conditions(found['conditions'])
+    tables['marching'] = table([_COMPARE[0], wrong, *_COMPARE[1:]], results['marching'], first['marching'])
+    tables['conditions'] = conditions(results['conditions'])
     tables['presets'] = presets
     tables['scaling'] = table(
-        _SCALING, [dict(row, sweep=sweep) for sweep, rows in found['scaling'].items() for row in rows]
+        _SCALING, [dict(row, sweep=sweep) for sweep, rows in results['scaling'].items() for row in rows]
     )
-    tables['initialisations'] = table(_INITIAL, found['initialisations'])
-    tables['fits'] = table(_FITS, found['fits'])
-    tables['field'] = table(FIELD, found['field'])
+    tables['initialisations'] = table(_INITIAL, results['initialisations'])
+    tables['fits'] = table(_FITS, results['fits'])
+    tables['field'] = table(FIELD, results['field'])
     return {name: tables[name] for name in TITLES}
 
 
@@ -76,9 +76,9 @@ def conditions(c: dict) -> str:
     )
 
 
-def preset_table(found: dict, beside: dict | None = None) -> str:
+def preset_table(results: dict, beside: dict | None = None) -> str:
     """The table of the presets. beside   see `make_tables`"""
-    columns, rows = list(_PRESETS), preset_rows(found['cutoff'])
+    columns, rows = list(_PRESETS), preset_rows(results['cutoff'])
     if beside:
         title = beside['conditions']['variant'].split('_')[0].upper()
         for row, other in zip(rows, preset_rows(beside['cutoff'])):
@@ -99,11 +99,11 @@ def read_presets(path: Path) -> dict:
     with reading(path):
         text = Path(path).read_text(encoding='utf-8')
     try:
-        found = json.loads(text)
-        preset_table(found, found)
+        presets = json.loads(text)
+        preset_table(presets, presets)
     except (ValueError, TypeError, KeyError, AttributeError):
         raise InputError(f'{path}: holds no presets; write it with lingo-mi accuracy --presets') from None
-    return found
+    return presets
 
 
 def preset_rows(cutoff: list[dict]) -> list[dict]:

@@ -224,17 +224,17 @@ class Cells:
         """The numbers of a cell, from its file or the record; None if it is in neither, or damaged."""
         needed = CT if isinstance(cell, Volume) else ('seconds_init', *NEW_VIEWS, *CT)
         try:
-            found = json.loads(self.path(cell).read_text(encoding='utf-8'))
+            numbers = json.loads(self.path(cell).read_text(encoding='utf-8'))
         except (OSError, ValueError):
-            found = None
-        if not (isinstance(found, dict) and found.keys() >= set(needed)):
-            found = None if self.record is None else self.record.get(self._key(cell))
-        return found if found and found.keys() >= set(needed) else None
+            numbers = None
+        if not (isinstance(numbers, dict) and numbers.keys() >= set(needed)):
+            numbers = None if self.record is None else self.record.get(self._key(cell))
+        return numbers if numbers and numbers.keys() >= set(needed) else None
 
     def record_all(self, cells: Iterable[Fit | Volume]) -> None:
         """Add those of the cells that are stored to the record."""
         if self.record is not None:
-            self.record.add({self._key(cell): found for cell in cells if (found := self.get(cell)) is not None})
+            self.record.add({self._key(cell): numbers for cell in cells if (numbers := self.get(cell)) is not None})
 
     def _key(self, cell: Fit | Volume) -> str:
         return self.path(cell).relative_to(self.folder).as_posix()
@@ -255,10 +255,10 @@ class Cells:
         path = self.path(cell)
         path.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(cell, Fit):
-            fit, found = cell, self._fit(cell, path, label, report)
+            fit, numbers = cell, self._fit(cell, path, label, report)
         else:
-            fit, found = cell.fit, self._volume(cell, path, label)
-        found |= dict(
+            fit, numbers = cell.fit, self._volume(cell, path, label)
+        numbers |= dict(
             object=fit.object,
             views=fit.views,
             seed=self.seed,
@@ -267,8 +267,8 @@ class Cells:
             provenance=provenance(self.command),
         )
         with replacing(path) as temporary:
-            temporary.write_text(json.dumps(found, indent=1, default=np.generic.item) + '\n', encoding='utf-8')
-        return found
+            temporary.write_text(json.dumps(numbers, indent=1, default=np.generic.item) + '\n', encoding='utf-8')
+        return numbers
 
     def compute_missing(self, planned: list[Fit | Volume], after_each: Callable[[], object]) -> dict:
         """Compute those of the planned cells that are not stored, one by one; the errors of those that failed, by cell.
@@ -292,10 +292,10 @@ class Cells:
             return read_scan(scans_in(Path(self.scale.data))[name])
         scanned = load_object(name, self.scale.size * self.scale.finer)
         with Progress(f'Scan of {name}', 2 * SCANNED) as bar:
-            found = scan(scanned, SCANNED, self.seed, lambda done, _: bar.update(done), self.scale.pixels)
+            dataset = scan(scanned, SCANNED, self.seed, lambda done, _: bar.update(done), self.scale.pixels)
         truth = averaged(scanned, self.scale.size)
-        assert found.test is not None  # of a simulated scan
-        return Dataset(self._counted(found.train.on(truth.grid)), found.test.on(truth.grid), truth.data)
+        assert dataset.test is not None  # of a simulated scan
+        return Dataset(self._counted(dataset.train.on(truth.grid)), dataset.test.on(truth.grid), truth.data)
 
     def _counted(self, scan: Scan) -> Scan:
         """The views as the scale's detector measures them."""
@@ -366,14 +366,14 @@ class Cells:
         if cell.algorithm == 'asd-pocs-r2':
             algorithm = replace(algorithm, maxl2err=R2_ERROR * float(np.linalg.norm(views.projections)))
         with progress_bar(algorithm, views, label) as progress:
-            found = run_algorithm(views, algorithm, progress=progress, **inputs)
+            result = run_algorithm(views, algorithm, progress=progress, **inputs)
         return dict(
             algorithm=cell.algorithm,
             options=algorithm.options,
             method=cell.fit.method,
-            seconds=found.seconds,
-            psnr_3d_r2=metrics.psnr_3d_r2(found.volume, dataset.volume),
-            ssim_3d_r2=metrics.ssim_3d_r2(found.volume, dataset.volume),
+            seconds=result.seconds,
+            psnr_3d_r2=metrics.psnr_3d_r2(result.volume, dataset.volume),
+            ssim_3d_r2=metrics.ssim_3d_r2(result.volume, dataset.volume),
         )
 
 

@@ -33,10 +33,10 @@ def available(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
     InputError
         For a name that is neither, and where no object is left.
     """
-    found = []
+    objects = []
     for name in names:
         if name in PHANTOMS or (path := _file(name)) is not None and path.is_file():
-            found.append(name)
+            objects.append(name)
         elif name in VOLUMES:
             say(f'{name}: skipped, since there is no {name}.nii.gz in the folder that LINGO_MI_DATA names')
         else:
@@ -44,11 +44,11 @@ def available(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
                 f'object {name!r} is unknown: use {", ".join((*PHANTOMS, *VOLUMES))}, or a volume NAME.nii.gz '
                 'in the folder that LINGO_MI_DATA names'
             )
-    if not found:
+    if not objects:
         raise InputError(
             f'no object is left: let LINGO_MI_DATA name the folder of the volumes, or use {" or ".join(PHANTOMS)}'
         )
-    return found
+    return objects
 
 
 def scans_in(folder: Path) -> dict[str, Path]:
@@ -63,10 +63,10 @@ def scans_in(folder: Path) -> dict[str, Path]:
         raise InputError(f'{folder}: is not a folder; give the folder with the scans')
     pickles = {path.stem.removesuffix('_50'): path for path in folder.iterdir() if path.suffix in ('.pickle', '.pkl')}
     folders = {path.name: path for path in folder.iterdir() if (path / META).is_file()}
-    found = dict(sorted((pickles | folders).items()))
-    if not found:
+    scans = dict(sorted((pickles | folders).items()))
+    if not scans:
         raise InputError(f'{folder}: holds neither pickles of SAX-NeRF or NAF nor folders of R2-Gaussian')
-    return found
+    return scans
 
 
 @functools.cache
@@ -100,11 +100,11 @@ def load_object(name: str, size: int) -> phantoms.Phantom:
     return averaged(phantoms.Phantom(volume.data, volume.spacing, name), size)
 
 
-def averaged(thing: phantoms.Phantom, size: int) -> phantoms.Phantom:
+def averaged(phantom: phantoms.Phantom, size: int) -> phantoms.Phantom:
     """An object on at most `size` voxels along its longest side, averaged over the voxels that each of these covers."""
-    shape = thing.data.shape
+    shape = phantom.data.shape
     if max(shape) <= size:
-        return thing
+        return phantom
     smaller = tuple(max(round(n * size / max(shape)), 1) for n in shape)
-    spacing = tuple(d * n / m for d, n, m in zip(thing.spacing, shape, smaller))
-    return phantoms.Phantom(resize_local_mean(thing.data, smaller).astype(np.float32), spacing, thing.name)
+    spacing = tuple(d * n / m for d, n, m in zip(phantom.spacing, shape, smaller))
+    return phantoms.Phantom(resize_local_mean(phantom.data, smaller).astype(np.float32), spacing, phantom.name)

@@ -46,6 +46,6 @@ class Record:
 
 
 def _scalars(cell: dict) -> dict:
-    made = cell.get('provenance') or {}
+    provenance = cell.get('provenance') or {}
     scalars = {k: round(v, 6) if isinstance(v, float) else v for k, v in cell.items() if not isinstance(v, dict | list)}
-    return scalars | {k: made[k] for k in ('commit', 'date', 'machine') if k in made}
+    return scalars | {k: provenance[k] for k in ('commit', 'date', 'machine') if k in provenance}

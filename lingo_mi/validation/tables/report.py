@@ -151,9 +151,9 @@ def groups(
             for row, method in CONTROLS.items()
         ]
     if table == 'scenes':
-        own = [Column(m, _fit(views[-1], m, last), CT) for m in methods if method_of(m).makes_volume]
+        columns = [Column(m, _fit(views[-1], m, last), CT) for m in methods if method_of(m).makes_volume]
         others = [Column(title, lambda name: None, CT[:1], published=p) for title, p in paper.SCENES.items()]
-        return [Group(views[-1], last, (*own, *others))]
+        return [Group(views[-1], last, (*columns, *others))]
     out = []
     for n in views:
         for parts, method in ABLATION.items():
@@ -194,13 +194,15 @@ def plan(table_groups: list[Group], objects: Iterable[str]) -> list[Fit | Volume
     """All cells of a table in the order to compute them: object by object, fits before what is made of them."""
     cells = {}
     for name in objects:
-        found = [cell for group in table_groups for column in group.columns if (cell := column.cell(name)) is not None]
-        fits = [cell.fit if isinstance(cell, Volume) else cell for cell in found]
+        planned = [
+            cell for group in table_groups for column in group.columns if (cell := column.cell(name)) is not None
+        ]
+        fits = [cell.fit if isinstance(cell, Volume) else cell for cell in planned]
         # Shorter fits first, since longer ones go on from them; then one fit's volumes together, since they share its views.
         order = sorted(dict.fromkeys(fits), key=lambda fit: (fit.views, fit.method, fit.iterations or 0))
         for fit in order:
-            own = dict.fromkeys(cell for cell in found if isinstance(cell, Volume) and cell.fit == fit)
-            cells |= dict.fromkeys([*([] if fit.method == 'none' else [fit]), *own])
+            volumes = dict.fromkeys(cell for cell in planned if isinstance(cell, Volume) and cell.fit == fit)
+            cells |= dict.fromkeys([*([] if fit.method == 'none' else [fit]), *volumes])
     return list(cells)
 
 
@@ -227,13 +229,13 @@ def results(table_groups: list[Group], objects: Iterable[str], every: Sequence[C
         spreads: list[dict] = []
         for name in objects:
             runs = {c.title: _runs(c, name, every) for c in group.columns}
-            values = {title: _over(found, np.mean) for title, found in runs.items()}
+            values = {title: _over(numbers, np.mean) for title, numbers in runs.items()}
             row(name, values)
             planned = [c.title for c in group.columns if c.cell(name) is not None]
             if planned and all(values[title] for title in planned):
                 complete[name] = values
                 if all(len(runs[title]) > 1 for title in planned):
-                    spreads.append({title: _over(found, _variance) for title, found in runs.items()})
+                    spreads.append({title: _over(numbers, _variance) for title, numbers in runs.items()})
         if complete:
             row(f'mean of {len(complete)}', _columns(complete.values(), np.mean))
         if len(complete) > 1:
@@ -269,7 +271,7 @@ def _runs(column: Column, name: str, every: Sequence[Cells]) -> list[dict]:
         return [{column.fields[0]: column.published[name]}] if name in column.published else []
     if (cell := column.cell(name)) is None:
         return []
-    return [{field: found[field] for field in column.fields} for cells in every if (found := cells.get(cell))]
+    return [{field: numbers[field] for field in column.fields} for cells in every if (numbers := cells.get(cell))]
 
 
 def _over(dicts: Sequence[dict], function: Callable) -> dict | None:
@@ -334,8 +336,8 @@ def write(table: str, table_groups: list[Group], objects: Iterable[str], every: 
     planned = plan(table_groups, objects)
     done = sum(cells.get(cell) is not None for cell in planned for cells in every)
     scale, cells = every[0].scale, every[0]
-    for own in every:
-        own.record_all(planned)
+    for seeded in every:
+        seeded.record_all(planned)
     finer = f' (scanned on {scale.finer} times as many)' if scale.finer > 1 else ''
     noise = (
         f'{scale.photons:g} photons a pixel in the open beam, electronic noise of {scale.electronic_noise:g}, '
@@ -348,7 +350,7 @@ def write(table: str, table_groups: list[Group], objects: Iterable[str], every: 
     else:
         scans = f'Scale `{name}`: at most {scale.size} voxels a side{finer}, {scale.pixels} x {scale.pixels} pixels'
     chosen = 'the first views; ' if scale.first else ''
-    seeds = f'seed{"s" * (len(every) > 1)} {", ".join(str(own.seed) for own in every)}'
+    seeds = f'seed{"s" * (len(every) > 1)} {", ".join(str(seeded.seed) for seeded in every)}'
     text = (
         f'# {TITLES[table]}\n\n{NOTES[table]}\n\n{scans}, {scale.n_points:,} Gaussians to start with '
         f'(`xgaussian`: one on every eighth voxel a side); {chosen}{noise}{seeds}; {done} of '

@@ -30,11 +30,11 @@ def compute_missing(
     jobs = [
         Job(
             name,
-            sum(map(steps_of(cells.scale), own)),
+            sum(map(steps_of(cells.scale), members)),
             compute_series,
-            (cells.folder, cells.scale, cells.seed, command(), cells.record, own),
+            (cells.folder, cells.scale, cells.seed, command(), cells.record, members),
         )
-        for name, own in series.items()
+        for name, members in series.items()
     ]
 
     def tell(event: Event) -> None:
