@@ -44,7 +44,7 @@ from lingo_mi.storage.file_access import reading, replacing
 _OURS = 'lingo_mi: '
 # Raw files known by their content: SHA-1 of the git blob -> shape [x, y, z], type. The first is the
 # rotational C-arm scan `foot` of the volvis.org collection.
-_KNOWN_RAW = {'2888630277536561269f9632164e4b21088ab00d': ((256, 256, 256), 'uint8')}
+_RAW_LAYOUTS = {'2888630277536561269f9632164e4b21088ab00d': ((256, 256, 256), 'uint8')}
 
 
 @dataclass(frozen=True)
@@ -143,9 +143,9 @@ def _raw(path, shape, dtype):
         size = os.path.getsize(path)
     if shape is None or dtype is None:
         layout = None
-        if size in {math.prod(s) * np.dtype(d).itemsize for s, d in _KNOWN_RAW.values()}:
+        if size in {math.prod(s) * np.dtype(d).itemsize for s, d in _RAW_LAYOUTS.values()}:
             with reading(path):
-                layout = _KNOWN_RAW.get(git_blob_sha1(Path(path).read_bytes()))
+                layout = _RAW_LAYOUTS.get(git_blob_sha1(Path(path).read_bytes()))
         if layout is None:
             raise InputError(f'{path}: raw bytes have no header; give the shape (x, y, z) and the dtype')
         shape, dtype = layout

@@ -97,8 +97,8 @@ def _on_host(argument: Argument, name: str) -> Argument:
 def _kind(arguments: Sequence[Argument], name: str) -> str:
     kinds = [framework_of(a.array) for a in arguments]
     if len(set(kinds)) > 1:
-        given_kinds = ', '.join(f'{a.name} of {k}' for a, k in zip(arguments, kinds))
-        raise InputError(f'{name}: the arrays must be of one kind, not {given_kinds}')
+        kinds_text = ', '.join(f'{a.name} of {k}' for a, k in zip(arguments, kinds))
+        raise InputError(f'{name}: the arrays must be of one kind, not {kinds_text}')
     return kinds[0]
 
 

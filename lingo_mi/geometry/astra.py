@@ -145,7 +145,7 @@ def in_space(proj_geom: dict) -> dict:
     if not kind.endswith('_vec'):
         width = _number(proj_geom, 'DetectorWidth')
         return {**proj_geom, **flat, 'DetectorSpacingX': width, 'DetectorSpacingY': width}
-    vectors = limits.lengths('Vectors', _given(proj_geom, 'Vectors'))
+    vectors = limits.lengths('Vectors', _value_of(proj_geom, 'Vectors'))
     if vectors.ndim != 2 or vectors.shape[1] != 6:
         raise InputError(
             f'the Vectors of {kind} must be 6 numbers for every view, not an array of shape {vectors.shape}'
@@ -175,7 +175,7 @@ def circle(proj_geom: dict) -> dict[str, Any]:
         nDetector=_panel(proj_geom),
         dDetector=(_number(proj_geom, 'DetectorSpacingY'), _number(proj_geom, 'DetectorSpacingX')),
         # ASTRA's source is at DSO (sin a, -cos a, 0).
-        angles=limits.angles('ProjectionAngles', _given(proj_geom, 'ProjectionAngles')) - np.pi / 2,
+        angles=limits.angles('ProjectionAngles', _value_of(proj_geom, 'ProjectionAngles')) - np.pi / 2,
     )
 
 
@@ -193,7 +193,7 @@ def pose_rays(proj_geom: dict) -> tuple[Rays, tuple[int, int]]:
     if kind not in VECTORS:
         types = ', '.join(CIRCLES | VECTORS | IN_PLANE)
         raise InputError(f'an ASTRA geometry must be of the type {types}, not {shown(kind)}')
-    nDetector, vectors, radius = _panel(proj_geom), _given(proj_geom, 'Vectors'), None
+    nDetector, vectors, radius = _panel(proj_geom), _value_of(proj_geom, 'Vectors'), None
     if kind == 'cyl_cone_vec':
         vectors = limits.lengths('Vectors', vectors)
         if vectors.ndim != 2 or vectors.shape[1] != 13 or len(set(vectors[:, 12])) != 1:
@@ -219,7 +219,7 @@ def grid(vol_geom: dict) -> Grid:
     InputError
         If a number is missing or makes no grid.
     """
-    window = _given(vol_geom, 'option')
+    window = _value_of(vol_geom, 'option')
     if 'GridSliceCount' not in vol_geom:  # of two dimensions
         half = (_number(window, 'WindowMaxX') - _number(window, 'WindowMinX')) / _number(vol_geom, 'GridColCount') / 2
         vol_geom, window = {**vol_geom, 'GridSliceCount': 1}, {**window, 'WindowMinZ': -half, 'WindowMaxZ': half}
@@ -249,13 +249,13 @@ def _panel(proj_geom) -> tuple[int, int]:
 
 
 def _number(values: dict, name: str) -> float:
-    value = limits.lengths(name, _given(values, name))
+    value = limits.lengths(name, _value_of(values, name))
     if value.ndim:
         raise InputError(f'{name} of the ASTRA geometry must be one number, not {shown(value)}')
     return float(value)
 
 
-def _given(values: dict, name: str):
+def _value_of(values: dict, name: str):
     if not isinstance(values, Mapping) or name not in values:
         raise InputError(f'the ASTRA geometry has no {name}')
     return values[name]

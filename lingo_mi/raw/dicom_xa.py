@@ -55,7 +55,7 @@ def numbers(file: Path, header: Any) -> _Run:
     InputError
         If it is not a projection, or its pixels do not grow with the counts.
     """
-    if _found(header, 0, 'ImagePositionPatient') is not None:
+    if _attribute(header, 0, 'ImagePositionPatient') is not None:
         name = header.get('SOPClassUID')
         raise InputError(
             f'{file}: is not a projection, but a slice or a volume ({getattr(name, "name", "of no class")}): read it as a volume'
@@ -77,10 +77,10 @@ def numbers(file: Path, header: Any) -> _Run:
         'DSD': ('DistanceSourceToDetector',),
         'ImagerPixelSpacing': ('ImagerPixelSpacing',),
     }
-    values = {key: floats(_first(_found(header, 0, name) for name in names)) for key, names in distances.items()}
+    values = {key: floats(_first(_attribute(header, 0, name) for name in names)) for key, names in distances.items()}
     values |= _angles(header, n)
     for name in 'DetectorPrimaryAngle', 'DetectorSecondaryAngle':
-        tilted = floats(_found(header, 0, name))
+        tilted = floats(_attribute(header, 0, name))
         if tilted is not None and tilted.any():
             warnings.warn(f'{file}: {name} is not read: calibrate the scan if its axis is off', stacklevel=2)
     orientation = header.get('PatientOrientation')
@@ -147,11 +147,11 @@ def _lacking(run):
 
 def _angles(header, n):
     """The angles of n frames by name, None where they are missing; `first`: the primary one of the first frame."""
-    out = {'first': floats(_found(header, 0, _PRIMARY))}
+    out = {'first': floats(_attribute(header, 0, _PRIMARY))}
     for name in _PRIMARY, _SECONDARY:
         start, steps = floats(header.get(name)), floats(header.get(name + 'Increment'))
         if 'PerFrameFunctionalGroupsSequence' in header:
-            values = [value for k in range(n) if (value := floats(_found(header, k, name))) is not None]
+            values = [value for k in range(n) if (value := floats(_attribute(header, k, name))) is not None]
             out[name] = np.concatenate(values) if len(values) == n else None
         elif start is None or (steps is None and n > 1 and name == _PRIMARY):
             out[name] = None
@@ -162,7 +162,7 @@ def _angles(header, n):
     return out
 
 
-def _found(header, k, name):
+def _attribute(header, k, name):
     """An attribute of frame k: its own, one that all frames share, or the file's; None where it has none."""
     frames, shared = (header.get(f'{of}FunctionalGroupsSequence') for of in ('PerFrame', 'Shared'))
     groups = [*(frames or [])[k : k + 1], *(shared or [])[:1]]

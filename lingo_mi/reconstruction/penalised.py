@@ -189,7 +189,7 @@ class PenalisedLeastSquares(Algorithm):
             x, i, trials = tried(i - 1, x), i - 1, trials + 1
             if scores[i] > SLACK * min(scores.values()):
                 break
-        chosen = min(i for i, found in scores.items() if found <= SLACK * min(scores.values()))
+        chosen = min(i for i, error in scores.items() if error <= SLACK * min(scores.values()))
         return PATH[chosen], solver.system.volume(best), list(scores.values()), done
 
 

@@ -30,7 +30,7 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.projectors.objects import find_objects
 from lingo_mi.projectors.sensors import view_of
 from lingo_mi.scene.load import load_file
-from lingo_mi.validation.oracle import Pose, one_integral
+from lingo_mi.validation.oracle import Pose, gaussian_integral
 
 EXTENT = 8.0
 COLUMNS = {'centre': slice(0, 3), 'scale': slice(3, 6), 'rotation': slice(6, 10)}  # of an ellipsoids' `data`
@@ -120,7 +120,7 @@ def check_gradients(scene: Any, step: float = 1e-4, count: int = 4, seed: int = 
 
     def loss(values):
         """That of one Gaussian alone, (centre, scale, quaternion, density)."""
-        return slope @ one_integral((values[:3], values[3:6], values[6:10], values[10]), *rays)
+        return slope @ gaussian_integral((values[:3], values[3:6], values[6:10], values[10]), *rays)
 
     def image():
         return np.array(line.render(scene), float)[..., 0].ravel()

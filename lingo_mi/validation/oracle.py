@@ -116,7 +116,7 @@ def whiten(scale: ArrayLike, rotation: ArrayLike, vectors: np.ndarray) -> np.nda
     return vectors @ Rotation.from_quat(rotation).as_matrix() / scale
 
 
-def one_integral(gaussian: tuple, start: np.ndarray, direction: np.ndarray, begin: float = -np.inf) -> np.ndarray:
+def gaussian_integral(gaussian: tuple, start: np.ndarray, direction: np.ndarray, begin: float = -np.inf) -> np.ndarray:
     """Line integrals of one Gaussian along rays, for t from `begin` on, [M].
 
     Parameters
@@ -139,7 +139,7 @@ def one_integral(gaussian: tuple, start: np.ndarray, direction: np.ndarray, begi
 def line_integrals(cloud: Cloud, pose: Pose) -> np.ndarray:
     """The image of a cloud, [height * width], row by row."""
     rays = pose.rays()
-    return sum((one_integral(row, *rays, pose.begin) for row in rows(cloud)), np.zeros(pose.height * pose.width))
+    return sum((gaussian_integral(row, *rays, pose.begin) for row in rows(cloud)), np.zeros(pose.height * pose.width))
 
 
 def rows(cloud: Cloud) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray, float]]:
@@ -156,7 +156,7 @@ def derivative(function: Callable[..., Any], step: Any) -> Any:
 def gradients(cloud: Cloud, pose: Pose, weights: np.ndarray) -> dict[str, np.ndarray]:
     """Derivatives of sum(weights * image) by all parameters: a dict of arrays shaped like the cloud's."""
     rays = pose.rays()
-    return _gradients(cloud, lambda row: (weights * one_integral(row, *rays, pose.begin)).sum())
+    return _gradients(cloud, lambda row: (weights * gaussian_integral(row, *rays, pose.begin)).sum())
 
 
 def values_at(cloud: Cloud, points: np.ndarray) -> np.ndarray:

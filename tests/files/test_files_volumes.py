@@ -298,14 +298,14 @@ def test_raw_has_x_fastest(tmp_path, dtype):
 
 def test_known_raw_files_need_no_shape(tmp_path, monkeypatch):
     assert git_blob_sha1(b'hello\n') == 'ce013625030ba8dba906f756967f9e9ca394464a'
-    assert volumes._KNOWN_RAW['2888630277536561269f9632164e4b21088ab00d'] == ((256, 256, 256), 'uint8')
+    assert volumes._RAW_LAYOUTS['2888630277536561269f9632164e4b21088ab00d'] == ((256, 256, 256), 'uint8')
     path = tmp_path / 'known.raw'
     path.write_bytes(COUNTS.transpose(2, 1, 0).tobytes())
     refused(path, 'give the shape')
-    monkeypatch.setitem(volumes._KNOWN_RAW, git_blob_sha1(path.read_bytes()), (SHAPE, 'uint8'))
+    monkeypatch.setitem(volumes._RAW_LAYOUTS, git_blob_sha1(path.read_bytes()), (SHAPE, 'uint8'))
     np.testing.assert_allclose(read_volume(path).data, COUNTS / 119, rtol=1e-6)
     path.write_bytes(COUNTS.transpose(2, 1, 0).astype('u2').tobytes())
-    monkeypatch.setitem(volumes._KNOWN_RAW, git_blob_sha1(path.read_bytes()), (SHAPE, 'uint16'))
+    monkeypatch.setitem(volumes._RAW_LAYOUTS, git_blob_sha1(path.read_bytes()), (SHAPE, 'uint16'))
     np.testing.assert_allclose(read_volume(path).data, COUNTS / 119, rtol=1e-6)
 
 

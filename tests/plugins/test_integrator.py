@@ -171,7 +171,7 @@ def test_rays_are_the_sensors_own(name):
     assert np.abs(off).max() < 1e-5
 
     cloud = cloud_of()
-    expected = sum(oracle.one_integral(row, start, direction) for row in oracle.rows(cloud))
+    expected = sum(oracle.gaussian_integral(row, start, direction) for row in oracle.rows(cloud))
     assert relative(render(load(dict(cloud=ellipsoids(cloud)), cameras()[name])), expected) < 2e-6
 
 
@@ -235,7 +235,9 @@ def test_forward_mode():
     by_grid = rng.normal(size=values.shape)
     rays = pose(SCANNER).rays()
     d_cloud = sum(
-        oracle.derivative(lambda t: oracle.one_integral([getattr(cloud, k)[i] + t * by[k][i] for k in by], *rays), 1e-2)
+        oracle.derivative(
+            lambda t: oracle.gaussian_integral([getattr(cloud, k)[i] + t * by[k][i] for k in by], *rays), 1e-2
+        )
         for i in range(len(cloud))
     )
     d_line = d_cloud + render(load(dict(grid=grid(by_grid)))).ravel()

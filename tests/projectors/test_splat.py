@@ -284,7 +284,7 @@ def test_tangent_of_line_integrals(name):
     rays = *pose.rays(), pose.begin
     expected = sum(
         oracle.derivative(
-            lambda t: oracle.one_integral([getattr(cloud, k)[i] + t * by[k][i] for k in PARAMETERS], *rays), 1e-2
+            lambda t: oracle.gaussian_integral([getattr(cloud, k)[i] + t * by[k][i] for k in PARAMETERS], *rays), 1e-2
         )
         for i in range(n)
     )
