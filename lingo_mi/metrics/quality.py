@@ -46,7 +46,7 @@ def psnr_2d_r2(images: ArrayLike, truth: ArrayLike) -> float:
     positive pixel is compared undivided.
     """
     images, truth = _pair(images, truth, 'projections', '[view, v, u]')
-    return _mean(_each(lambda a, b: _psnr(a, b, 1.0), _by_truth_maximum(images, truth), images[0].size))
+    return _mean(_each(lambda a, b: _psnr(a, b, 1.0), _scaled_to_maximum(images, truth), images[0].size))
 
 
 def psnr_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
@@ -72,7 +72,7 @@ def ssim_2d_r2(images: ArrayLike, truth: ArrayLike) -> float:
         Views whose truth has no positive pixel are left out.
     """
     images, truth = _pair(images, truth, 'projections', '[view, v, u]')
-    return _mean(_each(_ssim, _by_truth_maximum(images, truth), images[0].size))
+    return _mean(_each(_ssim, _scaled_to_maximum(images, truth), images[0].size))
 
 
 def ssim_2d(images: ArrayLike, truth: ArrayLike, peak: float | None = None) -> float:
@@ -218,7 +218,7 @@ def _peak(truth, peak):
     return float(peak)
 
 
-def _by_truth_maximum(images, truth):
+def _scaled_to_maximum(images, truth):
     for a, b in zip(images, truth):
         a, b = a.astype(float), b.astype(float)
         if b.max() > 0:

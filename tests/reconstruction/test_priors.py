@@ -149,7 +149,7 @@ def test_generalised_variation_is_the_least(tiny):
 
     prior = TGV(second=1.5, inner=600)
     found = tiny_prox(prior, tiny, 0.1)
-    field = np.concatenate([c.numpy() for c in prior._kept[0]])
+    field = np.concatenate([c.numpy() for c in prior._state[0]])
     assert_least(cost, np.r_[found.ravel(), field], 24)
     assert np.abs(found - tiny_prox(TV(inner=200), tiny, 0.1)).max() > 0.01
 

@@ -167,10 +167,10 @@ def test_a_fit_that_stops_early(live):
     """First its search, then the steps until where it stops; `gaussians` is None for a neural field."""
     watch = Watch([live], 1000)
     told = lambda **fields: watch.step(loss=lambda: 0.5, gaussians=None, **fields)  # noqa: E731
-    watch._told = -1.0
+    watch._reported = -1.0
     told(iteration=10, held_out=0.25)
     assert asked(live)['line'].startswith('Search for the step to stop at: step 10, error of the views held out 0.25.')
-    watch._told = -1.0
+    watch._reported = -1.0
     told(iteration=100, stops_at=400)
     assert asked(live)['line'].startswith('Step 100 of 400, loss 0.5, ')
     told(iteration=400, stops_at=400)
