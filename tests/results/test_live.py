@@ -117,7 +117,7 @@ class Failing:
         self._fail('step')
 
     def snapshot(self, fit):
-        self._fail('look')
+        self._fail('snapshot')
 
     def close(self, finished):
         self._fail('close')
@@ -127,7 +127,7 @@ class Failing:
             raise RuntimeError('no\nviewer')
 
 
-@pytest.mark.parametrize('at', ['step', 'look', 'close'])
+@pytest.mark.parametrize('at', ['step', 'snapshot', 'close'])
 def test_a_watcher_that_fails_is_left_out(data, at, monkeypatch):
     monkeypatch.setattr('lingo_mi.api.fitting.watchers_of', lambda *_: [Failing(at)])
     with pytest.warns(UserWarning, match=r'Failing has failed \(no viewer\); the fit goes on'):
