@@ -14,6 +14,7 @@ if hasattr(os, 'sched_setaffinity'):
         os.sched_setaffinity(0, own[int(os.environ['PYTEST_XDIST_WORKER'].removeprefix('gw')) :: workers])
 
 import lingo_mi  # noqa: F401 - before any test module loads Dr.Jit, so that Dr.Jit finds the bundled libLLVM
+from helpers.phantoms import made_once
 from helpers.same import STAND_IN, adds_in_any_order
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as a shell starts what runs in the background
@@ -53,6 +54,13 @@ def variant() -> str:
     from lingo_mi.common.runtime import use_variant
 
     return use_variant(VARIANT)
+
+
+@pytest.fixture(scope='session', autouse=True)
+def phantoms_made_once():
+    """Phantoms are the same arrays in all tests of a process."""
+    with made_once():
+        yield
 
 
 @pytest.fixture

@@ -109,9 +109,9 @@ def row_scan(mode, views, total, columns, told=0.0, true=0.0, width=1.4):
 @pytest.mark.parametrize(
     ('mode', 'width', 'told', 'true'),
     [
-        ('parallel', 0.63, -20, -22),  # half a fan
+        pytest.param('parallel', 0.63, -20, -22, marks=pytest.mark.thorough),  # half a fan
         ('cone', 0.84, -20, -22),
-        ('cone', 0.56, 0, 0),  # a region of interest
+        pytest.param('cone', 0.56, 0, 0, marks=pytest.mark.thorough),  # a region of interest
         ('cone', 0.56, 0, -2),
         ('parallel', 3.6, 0, 22),  # far off
     ],
@@ -137,7 +137,7 @@ def test_an_object_that_is_cut_turns_no_panel():
     assert any('no edge of the panel shows air' in line for line in found.lines())
 
 
-@pytest.mark.parametrize('tilt', [0.0, 0.01])
+@pytest.mark.parametrize('tilt', [pytest.param(0.0, marks=pytest.mark.thorough), 0.01])
 def test_a_drift_of_the_beam_is_no_geometry(tilt):
     """A level that drifts by 4 % of the exposure, uniform or with slopes across the panel: read beside the object, taken out."""
     geometry, data = scanner(24, rows=40)

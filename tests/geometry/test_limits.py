@@ -76,7 +76,17 @@ def variants(value, name):
             yield [value if k == i else usual[k % len(usual)] for k in range(size)]
 
 
-@pytest.mark.parametrize('beam, name', [(beam, name) for beam, (*_, names) in BEAMS.items() for name in names])
+@pytest.mark.parametrize(
+    'beam, name',
+    [
+        # All numbers of a cone and of a scan by views; of the others those that a cone does not have, and motions.
+        pytest.param(
+            beam, name, marks=pytest.mark.thorough if beam in ('parallel', 'helix', 'circle') and name in CONE else ()
+        )
+        for beam, (*_, names) in BEAMS.items()
+        for name in names
+    ],
+)
 def test_one_extreme_number(beam, name):
     make, numbers, _ = BEAMS[beam]
     for value in EXTREME:

@@ -1,7 +1,6 @@
 """Runs scripts, commands and studies for tests: in this process, where Mitsuba is loaded already, or in a new one."""
 
 import contextlib
-import functools
 import io
 import runpy
 import subprocess
@@ -12,7 +11,6 @@ from unittest import mock
 import mitsuba as mi
 
 from lingo_mi.cli import run as run_command
-from lingo_mi.phantoms import foot
 
 FIT = Path(__file__).parents[2] / 'scripts' / 'fit.py'
 
@@ -43,15 +41,6 @@ SCENE = """<scene version="3.0.0">
 """
 
 
-_build = functools.lru_cache(foot.build)
-
-
-def _foot(size, seed):
-    """The foot, made once: it takes a second, even of 24 voxels a side, and hundreds of commands start with it."""
-    data, *rest = _build(size, seed)
-    return data.copy('K'), *rest
-
-
 def fit(*args, report=False):
     """Exit code, standard output and standard error of `fit.py ARGS`, run in this process.
 
@@ -69,14 +58,7 @@ def run(what, *args, report=False, variant=True):
     out, err = io.StringIO(), io.StringIO()
     argv = [str(what), *map(str, args), *(['--variant', mi.variant()] if variant and '--variant' not in args else [])]
     drawn = contextlib.nullcontext() if report else mock.patch('lingo_mi.fitting.save.write_report')
-    made = mock.patch.object(foot, 'build', _foot)
-    with (
-        drawn,
-        made,
-        mock.patch.object(sys, 'argv', argv),
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-    ):
+    with drawn, mock.patch.object(sys, 'argv', argv), contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
             if isinstance(what, Path):
                 runpy.run_path(str(what), run_name='__main__')

@@ -152,21 +152,23 @@ def test_voxel_centres():
     np.testing.assert_allclose(voxel_centres((2, 3, 4), (1, 0.6, 0.4), [13]), centres[1, 0, 1][None])
 
 
-@pytest.mark.parametrize('blocks', [False, True])
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 @pytest.mark.parametrize('misses, outside', [(0, 'invalid'), (2, 'invalid'), (0, 'ignore'), (1, 'ignore')])
-def test_valid_voxels(monkeypatch, blocks, mode, misses, outside):
-    if blocks:  # the coarse rejection must change nothing
-        monkeypatch.setattr(voxel_filter, 'CHUNK', 100)
-        monkeypatch.setattr(voxel_filter, 'BLOCK', 3)
+def test_valid_voxels(monkeypatch, mode, misses, outside):
     geometry = scan(mode, dDetector=(0.1037, 0.0911), nVoxel=(9, 7, 6))  # panel too small
     frames, grid = geometry.normalised_rays(), geometry.grid.shape
     found = random_masks(len(frames), geometry.nDetector, np.random.default_rng(4))
-    low, high = valid_voxels(frames, found, grid, geometry.grid.half, misses, outside)
-    for cells, images in (low, found.low), (high, found.high):
-        expected = literal_filter(frames, images, grid, geometry.grid.half, misses, outside == 'ignore')
-        assert cells.tolist() == expected
-    assert 0 < len(low) < np.prod(grid) and len(high) < len(low)
+    expected = [
+        literal_filter(frames, images, grid, geometry.grid.half, misses, outside == 'ignore')
+        for images in (found.low, found.high)
+    ]
+    assert 0 < len(expected[0]) < np.prod(grid) and len(expected[1]) < len(expected[0])
+    for blocks in (False, True):
+        if blocks:  # the coarse rejection must change nothing
+            monkeypatch.setattr(voxel_filter, 'CHUNK', 100)
+            monkeypatch.setattr(voxel_filter, 'BLOCK', 3)
+        cells = valid_voxels(frames, found, grid, geometry.grid.half, misses, outside)
+        assert [c.tolist() for c in cells] == expected
 
 
 def test_points_outside_the_image_are_removed_not_clamped():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import lingo_mi as lm
+from helpers.phantoms import forget
 from lingo_mi import phantoms
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.ply import read_ply
@@ -80,6 +81,7 @@ def test_form(made, name):
 @pytest.mark.parametrize('name', phantoms.names())
 def test_seed(made, name):
     data = phantoms.make(name, 16).data
+    forget()
     assert np.array_equal(phantoms.make(name, 16).data, data)
     assert np.array_equal(phantoms.make(name, 16, seed=7).data, data) == (name in ('mesh', 'shepp_logan'))
 

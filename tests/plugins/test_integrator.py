@@ -431,15 +431,25 @@ def test_scene_file(scene_file):
     assert relative(render(mi.load_file(str(scene_file))), expected) < 2e-6
 
 
+ORDERS = (
+    'import lingo_mi, mitsuba as mi; mi.set_variant("{}")',
+    'import mitsuba as mi; mi.set_variant("{}"); import lingo_mi',
+    'import mitsuba as mi; mi.set_variant("scalar_rgb"); import lingo_mi; mi.set_variant("{}")',
+)
+
+
 @pytest.mark.parametrize(
-    'order',
+    'order, kind',
     [
-        'import lingo_mi, mitsuba as mi; mi.set_variant("{}")',
-        'import mitsuba as mi; mi.set_variant("{}"); import lingo_mi',
-        'import mitsuba as mi; mi.set_variant("scalar_rgb"); import lingo_mi; mi.set_variant("{}")',
+        (ORDERS[0], 'mono'),
+        (ORDERS[1], 'mono'),
+        (ORDERS[2], 'rgb'),
+        *(
+            pytest.param(*other, marks=pytest.mark.thorough)
+            for other in ((ORDERS[0], 'rgb'), (ORDERS[1], 'rgb'), (ORDERS[2], 'mono'))
+        ),
     ],
 )
-@pytest.mark.parametrize('kind', ['mono', 'rgb'])
 def test_either_import_order(order, kind, scene_file, variant):
     name = variant.rsplit('_', 1)[0] + '_' + kind
     code = f'{order.format(name)}\nimport numpy\nprint(numpy.array(mi.render(mi.load_file({str(scene_file)!r}))).sum())'

@@ -79,7 +79,15 @@ def cloud_of(name='random', n=40):
     return random_cloud(rng, n)
 
 
-@pytest.mark.parametrize('name', ['random', 'needles'])
+@pytest.mark.parametrize(
+    'scanner, name',
+    [
+        *((scanner, 'random') for scanner in SCANNERS),
+        ('wide', 'needles'),
+        *(pytest.param(s, 'needles', marks=pytest.mark.thorough) for s in SCANNERS if s != 'wide'),
+    ],
+    indirect=['scanner'],
+)
 def test_images_and_gradients(scanner, name):
     """As accurate as on flat panels: `test_splat` allows the same."""
     cloud, pose = cloud_of(name), lines(scanner)

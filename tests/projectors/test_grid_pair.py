@@ -89,7 +89,7 @@ def test_which_projector_a_scan_gets():
     [
         ('sart', 40, dict(niter=3)),
         ('os-sart', 60, dict(niter=4, blocksize=6)),
-        ('cgls', 120, dict(niter=12)),
+        pytest.param('cgls', 120, dict(niter=12), marks=pytest.mark.thorough),
         ('asd-pocs', 40, dict(niter=3)),
     ],
 )

@@ -32,8 +32,14 @@ LARGE = {
 }
 
 
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
-@pytest.mark.parametrize('name', SMALL)
+@pytest.mark.parametrize(
+    'name, mode',
+    [
+        pytest.param(name, mode, marks=pytest.mark.thorough if mode == 'cone' and name in ('sirt', 'cgls') else ())
+        for name in SMALL
+        for mode in ('cone', 'parallel')
+    ],
+)
 def test_ball(name, mode):
     check(name, *SMALL[name], mode, '(4, -7) mm')
 

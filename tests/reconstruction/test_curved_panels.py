@@ -25,7 +25,11 @@ def scan(views, offset=(4.0, 1.0), radius=None, **changes):
 
 @pytest.mark.parametrize(
     'name, views, options',
-    [('sart', 40, dict(niter=3)), ('cgls', 120, dict(niter=12)), ('asd-pocs', 40, dict(niter=5))],
+    [
+        ('sart', 40, dict(niter=3)),
+        pytest.param('cgls', 120, dict(niter=12), marks=pytest.mark.thorough),
+        ('asd-pocs', 40, dict(niter=5)),
+    ],
 )
 def test_iterative(name, views, options):
     measured = scan(views)
@@ -45,8 +49,18 @@ def test_penalised():
     np.testing.assert_allclose(run_algorithm(hardly, algorithm).volume, expected, atol=1e-5 * expected.max())
 
 
-@pytest.mark.parametrize('offset', [(4.0, 0.0), (4.0, 1.0), (4.0, 60.0)])
-@pytest.mark.parametrize('radius', [None, 380.0])
+@pytest.mark.parametrize(
+    'offset, radius',
+    [
+        ((4.0, 0.0), None),
+        ((4.0, 1.0), 380.0),
+        ((4.0, 60.0), None),
+        *(
+            pytest.param((4.0, offset), radius, marks=pytest.mark.thorough)
+            for offset, radius in ((0.0, 380.0), (1.0, None), (60.0, 380.0))
+        ),
+    ],
+)
 def test_fdk(offset, radius):
     """Centred, a quarter of a pixel off, and far to one side, as from a flat panel."""
     measured = scan(180, offset, radius)

@@ -23,6 +23,7 @@ from lingo_mi.reconstruction.slab_sweeps import digest_of, discard
 
 RECONSTRUCT = FIT.with_name('reconstruct.py')
 SHAPE = 24, 20, 16
+ALGORITHMS = SART(niter=3), OSSART(niter=3, blocksize=4, noneg=False), SIRT(niter=3)
 
 
 @pytest.fixture(scope='module')
@@ -45,9 +46,19 @@ def difference(found, whole):
     return np.abs(np.concatenate(list(found), 2) - whole).max() / np.abs(whole).max()
 
 
-@pytest.mark.parametrize('thickness', [1, 5, 8, 24])
 @pytest.mark.parametrize(
-    'algorithm', [SART(niter=3), OSSART(niter=3, blocksize=4, noneg=False), SIRT(niter=3)], ids=lambda a: a.name
+    'algorithm, thickness',
+    [
+        *((algorithm, 5) for algorithm in ALGORITHMS),
+        (SIRT(niter=3), 1),
+        *(
+            pytest.param(algorithm, thickness, marks=pytest.mark.thorough)
+            for algorithm in ALGORITHMS
+            for thickness in (1, 8, 24)
+            if (algorithm.name, thickness) != ('sirt', 1)
+        ),
+    ],
+    ids=lambda value: getattr(value, 'name', value),
 )
 def test_slabs_are_the_whole_volume(scan, tmp_path, algorithm, thickness):
     steps = []

@@ -61,10 +61,15 @@ def read(path):
     return reader
 
 
+@pytest.fixture(scope='module')
+def plain(tmp_path_factory):
+    return read(page(tmp_path_factory.mktemp('plain'), 'plain'))
+
+
 @pytest.mark.parametrize('markup', MARKUP)
-def test_markup_is_text(tmp_path, markup):
+def test_markup_is_text(tmp_path, plain, markup):
     """The page has the tags, the active attributes and the scripts of one without markup."""
-    found, plain = read(page(tmp_path / 'a', markup)), read(page(tmp_path / 'b', 'plain'))
+    found = read(page(tmp_path, markup))
     assert found.tags == plain.tags and found.active == plain.active == [('href', '#main')]
     assert len(found.scripts) == len(plain.scripts) and found.scripts[-1] == plain.scripts[-1]
     assert found.text.count(markup.replace('\udcff', '\\udcff')) >= 7  # title, heading, command, and the settings

@@ -1,5 +1,6 @@
 """Hard cases: line integrals and voxels where float32 is pressed, any cloud in any geometry, and fits on bad data."""
 
+import itertools
 from dataclasses import replace
 
 import drjit as dr
@@ -52,9 +53,23 @@ def two_threads(variant):
     use_threads(before)
 
 
+LONG = (
+    '1 million coincident Gaussians',
+    '1 million Gaussians',
+    '1000 views',
+    'views empty, saturated, noisy, repeated; Gaussians coincident',
+    *(
+        f'{kind} 1:1e4, {place}'
+        for kind, place in itertools.product(
+            ('needles', 'pancakes'), ('cone, close up', 'parallel, close up', 'cone, whole', 'parallel, whole')
+        )
+        if (kind, place) not in (('needles', 'cone, close up'), ('pancakes', 'parallel, whole'))
+    ),
+)
+
+
 def marked(case):
-    marks = pytest.mark.thorough if case.name == '1 million coincident Gaussians' else ()
-    return pytest.param(case, marks=marks, id=case.name)
+    return pytest.param(case, marks=pytest.mark.thorough if case.name in LONG else (), id=case.name)
 
 
 @pytest.mark.parametrize('case', [marked(case) for case in CASES])
@@ -292,13 +307,21 @@ def compare(cloud, view):
 
 
 COMMON = dict(deadline=None, suppress_health_check=list(HealthCheck), derandomize=True, database=None)
+settings.register_profile('short', max_examples=50, **COMMON)
 settings.register_profile('ci', max_examples=200, **COMMON)
 settings.register_profile('nightly', max_examples=10_000, **COMMON)
 
 
-@settings(settings.get_profile('ci'))
+@settings(settings.get_profile('short'))
 @given(clouds(), views())
 def test_any_cloud_in_any_view(cloud, view):
+    compare(cloud, view)
+
+
+@pytest.mark.thorough
+@settings(settings.get_profile('ci'))
+@given(clouds(), views())
+def test_more_clouds_in_more_views(cloud, view):
     compare(cloud, view)
 
 

@@ -160,7 +160,7 @@ def test_pixel_gradients(variant):
     assert all(fine[name] < coarse[name] / 8 for name in NAMES)
 
 
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize('mode', ['cone', pytest.param('parallel', marks=pytest.mark.thorough)])
 def test_pixel_area(variant, mode):
     """Better than 4 x 4 rays where the Gaussians are wider than a pixel, and nearly by the fourth power of its size."""
     coarse, fine = (Workload(60, 64 * k, 80.0 * k**2, order=6, mode=mode) for k in (1, 2))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from helpers.same import assert_same
+from helpers.script import run
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.ply import write_ply
 from lingo_mi.validation import gradient_check
@@ -105,9 +106,9 @@ def test_script_refuses_bad_input(tmp_path):
     broken = tmp_path / 'broken.xml'
     broken.write_text('<scene version="3.0.0"><shape type="nothing_known"/></scene>')
     for arguments in ((tmp_path / 'absent.xml',), (broken,), (scene_file(tmp_path), '-n', 0), (broken, '--step', 'x')):
-        done = script(*arguments)
-        assert done.returncode == 2 and done.stdout == ''
-        assert done.stderr.startswith('error: ') and len(done.stderr.strip().splitlines()) == 1
+        code, out, err = run(SCRIPT, *arguments)
+        assert code == 2 and out == ''
+        assert err.startswith('error: ') and len(err.strip().splitlines()) == 1
 
 
 def test_refusals(tmp_path):
