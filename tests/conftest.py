@@ -70,6 +70,12 @@ def sums_in_order(variant) -> None:
         pytest.skip('a GPU adds atomically, in any order')
 
 
+@pytest.fixture
+def no_report(monkeypatch) -> None:
+    """Results are written without their report, which takes longer to draw than a small fit."""
+    monkeypatch.setattr('lingo_mi.fitting.save.write_report', lambda *_: None)
+
+
 @pytest.fixture(scope='session')
 def data() -> Path:
     """The folder of test volumes that LINGO_MI_DATA names; skips where it names none."""

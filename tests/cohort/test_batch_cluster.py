@@ -120,12 +120,14 @@ def test_the_command_is_stopped(home, how):
         require_all_done_once(home)
 
 
-def test_local_workers(home):
-    (home / 'list.csv').write_text('name,geometry,iterations,n_points\na,tiny.xml,10,100\nb,tiny.xml,10,100\n')
-    code, text, err = run(BATCH, *arguments(home, 'local:2'))
+@pytest.mark.parametrize('number', [1, pytest.param(2, marks=pytest.mark.thorough)])
+def test_local_workers(home, number):
+    rows = [f'{name},tiny.xml,10,100\n' for name in NAMES[:number]]
+    (home / 'list.csv').write_text('name,geometry,iterations,n_points\n' + ''.join(rows))
+    code, text, err = run(BATCH, *arguments(home, f'local:{number}'))
     assert code == 0 and 'dashboard: http://127.0.0.1:' in err, err
-    assert [row['status'] for row in results(home).values()] == ['done'] * 2
-    assert len({line.split(': ')[1] for line in events(home, 'began')}) == 2
+    assert [row['status'] for row in results(home).values()] == ['done'] * number
+    assert len({line.split(': ')[1] for line in events(home, 'began')}) == number
 
 
 def test_workers_that_cannot_do_it(home):

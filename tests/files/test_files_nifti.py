@@ -63,12 +63,12 @@ def test_a_header_that_claims_more_than_there_is(tmp_path, name, shape):
 
 
 def test_extensions_and_what_follows_are_not_unpacked(tmp_path):
-    """A few hundred kilobytes that would unpack to hundreds of megabytes."""
+    """Less than a hundred kilobytes that would unpack to tens of megabytes."""
     content = np.ones(SHAPE, np.float32).tobytes()
     read_nifti(claiming(tmp_path / 'v.nii.gz', SHAPE, content))
     for path in (
-        claiming(tmp_path / 'after.nii.gz', SHAPE, content + bytes(100 << 20)),
-        claiming(tmp_path / 'before.nii.gz', SHAPE, bytes(100 << 20), vox_offset=2**40),
+        claiming(tmp_path / 'after.nii.gz', SHAPE, content + bytes(30 << 20)),
+        claiming(tmp_path / 'before.nii.gz', SHAPE, bytes(30 << 20), vox_offset=2**40),
     ):
         tracemalloc.start()
         with pytest.raises(InputError, match='more data follow|cannot hold'):
@@ -79,8 +79,8 @@ def test_extensions_and_what_follows_are_not_unpacked(tmp_path):
 
 @pytest.mark.parametrize('name', ['v.nii', 'v.nii.gz'])
 def test_an_extension_is_passed_over(tmp_path, name):
-    """One of a hundred megabytes, which a file of kilobytes can hold."""
-    start = 100 << 20 if name.endswith('.gz') else 1 << 10
+    """One of thirty megabytes, which a file of kilobytes can hold."""
+    start = 30 << 20 if name.endswith('.gz') else 1 << 10
     size = start - 352
     extension = struct.pack('<ii', size, 4) + bytes(size - 8)
     content = np.arange(120, dtype=np.float32).tobytes()

@@ -35,7 +35,7 @@ def data():
 
 
 @pytest.mark.parametrize('method', [lm.Fast, lm.R2, lm.LINGO])
-def test_fit(method, data, tmp_path):
+def test_fit(method, data, tmp_path, no_report):
     """Held-out views are predicted; what is written is read again, with the curved panel."""
     fit = lm.fit(data, method(iterations=120), progress=False)
     found = fit.metrics()['psnr_2d']
@@ -53,7 +53,7 @@ def test_fit(method, data, tmp_path):
     np.testing.assert_array_equal(again.render(data.test.geometry), fit.render(data.test.geometry))
 
 
-def test_the_scene_of_a_result_renders_it(data, tmp_path):
+def test_the_scene_of_a_result_renders_it(data, tmp_path, no_report):
     """Also if poses were corrected, of which no two panels are alike."""
     for name, rates in (('plain', '0,0'), ('poses', '2e-4,2e-5')):
         fit = lm.fit(data, lm.Fast(iterations=40).changed(rate_pose=rates), progress=False)

@@ -77,7 +77,7 @@ def searched_enough(done, **fields):
         raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize('where', ['search', 'between', 'fit'])
+@pytest.mark.parametrize('where', ['search', 'between', pytest.param('fit', marks=pytest.mark.thorough)])
 def test_resumed_it_is_the_same(scan, whole, tmp_path, where, sums_in_order):
     path = tmp_path / 'fit.npz'
     searched_enough.looks, searched_enough.errors = -1, None  # the first that is shown is no look

@@ -27,7 +27,15 @@ def foot():
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
-@pytest.mark.parametrize('name', ['foot', 'chest', 'shepp_logan', pytest.param('gaussians', marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    'name',
+    [
+        'foot',
+        'shepp_logan',
+        pytest.param('chest', marks=pytest.mark.thorough),
+        pytest.param('gaussians', marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize(('total', 'views'), [(360, 10), (360, 25), (180, 25), (220, 60)])
 def test_a_sound_scan_raises_no_alarm(name, mode, total, views):
     assert advised(scanned(name, mode, views, total)) == []
@@ -121,7 +129,7 @@ def noisy(p, level, kind):
 
 
 @pytest.mark.parametrize(('mode', 'kind'), [('cone', 'equal'), ('parallel', 'photons')])
-@pytest.mark.parametrize('level', [0.01, 0.02, 0.05])
+@pytest.mark.parametrize('level', [0.01, pytest.param(0.02, marks=pytest.mark.thorough), 0.05])
 def test_noisy_pixels_are_not_the_object(mode, level, kind):
     """Neither at the edge, nor where the axis is measured; an object that is there is found in as many views."""
     scan = scanned('foot', mode, 60)

@@ -223,23 +223,29 @@ def test_page_says_it_all(written):
     [
         (dict(truth=None, views_truth=None), 4),
         (dict(views=None, views_truth=None, cloud_centres=None, metrics={}), 1),
-        (dict(cloud_centres=np.zeros((0, 3)), cloud_density=np.zeros(0)), 3),
-        (dict(cloud_centres=np.zeros((1, 3)), cloud_density=np.zeros(1)), 4),
-        (dict(metrics=dict(history=[dict(iteration=1, loss=0.5)])), 4),
-        (dict(metrics=dict(history=[dict(iteration=1, loss=None, psnr_2d=float('nan'))])), 3),
-        (dict(views=np.zeros((1, 4, 5)), views_truth=np.zeros((1, 4, 5)), views_angles=[10.0]), 4),
-        (dict(volume=np.zeros(SHAPE), truth=np.zeros(SHAPE)), 4),
+        (
+            dict(
+                cloud_centres=np.zeros((0, 3)),
+                cloud_density=np.zeros(0),
+                metrics=dict(history=[dict(iteration=1, loss=None, psnr_2d=float('nan'))]),
+            ),
+            2,
+        ),
+        (
+            dict(
+                volume=np.zeros(SHAPE),
+                truth=np.zeros(SHAPE),
+                views=np.zeros((1, 4, 5)),
+                views_truth=np.zeros((1, 4, 5)),
+                views_angles=[10.0],
+                cloud_centres=np.zeros((1, 3)),
+                cloud_density=np.zeros(1),
+                metrics=dict(history=[dict(iteration=1, loss=0.5)]),
+            ),
+            4,
+        ),
     ],
-    ids=[
-        'measured',
-        'volume-only',
-        'empty-cloud',
-        'one-gaussian',
-        'one-entry',
-        'no-curve',
-        'blank-view',
-        'blank-volume',
-    ],
+    ids=['measured', 'volume-only', 'no-cloud-no-curve', 'blank-one-gaussian-one-entry'],
 )
 def test_what_is_missing_is_left_out(changes, images):
     data = content(**changes)

@@ -6,6 +6,8 @@ import lingo_mi as lm
 from helpers.script import run
 from studies.benchmarks.step import described, measured
 
+pytestmark = pytest.mark.usefixtures('no_report')
+
 
 def checkpoint(folder, method, **settings):
     """Of a short fit of three views."""

@@ -27,6 +27,7 @@ def test_a_wrong_scale_alone_costs_nothing_after_the_gain():
     np.testing.assert_allclose(found['psnr_3d'], 10 * np.log10(truth.max() ** 2 / (0.01 * (truth**2).mean())))
 
 
+@pytest.mark.thorough
 def test_an_experiment(tmp_path, monkeypatch):
     """Of the blur: three fits that differ, and the table and picture of them, by the function and by the command."""
     result = measure('psf', TINY, METHOD.changed(iterations=12))

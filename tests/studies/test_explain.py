@@ -49,6 +49,7 @@ def test_air_that_is_read_beside_the_object_is_a_row(tmp_path):
     assert found[explain.AIR] == pytest.approx(quiet['axis and turn of the panel'], rel=0.02)
 
 
+@pytest.mark.thorough
 def test_stored_rows_are_those_of_their_scan_and_numbers(tmp_path, monkeypatch):
     dataset = fan(24)
     calibration = lm.calibrate(dataset, progress=False)

@@ -39,6 +39,7 @@ def test_the_law():
     assert '| FDK | 2.00 | – | – | – |' in exponents(rows)
 
 
+@pytest.mark.thorough
 def test_the_command(tmp_path, monkeypatch):
     monkeypatch.setattr(sweep, 'DEPENDS', {'FDK': ('voxels', 'views')})
     monkeypatch.setattr(sweep, 'SIZES', dict(voxels=(8, 16, 24), views=(2, 4)))

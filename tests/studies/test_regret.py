@@ -19,6 +19,7 @@ def regret(monkeypatch, capsys, *args):
     return stop.value.code, *capsys.readouterr()
 
 
+@pytest.mark.thorough
 def test_a_small_table(monkeypatch, capsys, tmp_path):
     command = (
         '--objects',

@@ -123,7 +123,7 @@ def test_dead_columns():
     assert np.isfinite(found.render(scan.geometry)).all()
 
 
-def test_held_out_views_and_files_know_the_response(tmp_path, monkeypatch):
+def test_held_out_views_and_files_know_the_response(tmp_path, no_report):
     """Held-out views are compared with what the detector would measure, and metrics.json says what was found."""
     scan, true = measured(true_views(8), air=[[0.05], [0.03]])
     fitted = run(scan, SHORT.changed(iterations=20), seed=3)
@@ -135,7 +135,6 @@ def test_held_out_views_and_files_know_the_response(tmp_path, monkeypatch):
         of_response.expected(scan.geometry), true.applied(rendered, scan.geometry), rtol=1e-6, atol=1e-6
     )
     assert_same(fitted.expected(scan.geometry), fitted.render(scan.geometry))
-    monkeypatch.setattr('lingo_mi.fitting.save.write_report', lambda *_: None)
     of_response.with_data(Dataset(scan, scan)).save(tmp_path / 'fit')
     numbers = json.loads((tmp_path / 'fit' / 'metrics.json').read_text())
     assert numbers['response']['air_level'] == pytest.approx(true.report()['air_level'])
@@ -187,7 +186,7 @@ def test_bad_options(changes, message):
         SHORT.changed(**changes)
 
 
-def test_volumes_from_a_result_are_made_without_the_response(tmp_path, monkeypatch):
+def test_volumes_from_a_result_are_made_without_the_response(tmp_path, no_report):
     """Measured views are as the cloud's own: in Python, from the files of the result, and beside completed views."""
     scan, true = measured(true_views(8), air=[[0.05], [0.03]], gain=[[0], [0.06]])
     method = SHORT.changed(iterations=20, fit_air='smooth', fit_gain='smooth')
@@ -195,7 +194,6 @@ def test_volumes_from_a_result_are_made_without_the_response(tmp_path, monkeypat
     for part, known in zip(fitted.model.response.parts, true.parts):
         part.values = known.values.copy()
     fitted.checkpoint.arrays |= fitted.model.response.arrays()
-    monkeypatch.setattr('lingo_mi.fitting.save.write_report', lambda *_: None)
     fitted.save(tmp_path / 'fit')
     ideal = true.undone(scan.projections, scan.geometry)
     assert np.abs(ideal - scan.projections).max() > 0.05

@@ -139,7 +139,7 @@ def test_abstract_classes_are_no_methods():
             method_of(text)
 
 
-def test_a_method_of_another_package(tmp_path):
+def test_a_method_of_another_package(tmp_path, no_report):
     """It is found by its name, fits, is saved, and is loaded again."""
     scan = tiny_scan(geometry())
     method = 'outsider:line_points=40,lambda_root=3,iterations=24'
@@ -156,7 +156,7 @@ def test_a_method_of_another_package(tmp_path):
     assert other.method.start == lm.EdgeStart(50) and isinstance(other.method, Outsider)
 
 
-def test_what_a_fit_is_made_of(tmp_path):
+def test_what_a_fit_is_made_of(tmp_path, no_report):
     """Types that code around a fit may rely on."""
     scan = tiny_scan(geometry())
     fit = lm.fit(scan, Outsider(), iterations=3, progress=False)
