@@ -1,4 +1,4 @@
-"""Every example runs, with short fits: the gallery of the documentation runs them in full."""
+"""Every example runs, with short fits and small panels: the gallery of the documentation runs them in full."""
 
 import ast
 import json
@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import lingo_mi as lm
+from lingo_mi.phantoms import x3d_scan
 
 EXAMPLES = sorted((Path(__file__).parents[1] / 'examples').glob('[0-9]*.py'))
 NEEDS = {
@@ -46,8 +47,9 @@ def test_example(path, variant, monkeypatch, tmp_path):
     matplotlib.use('Agg')
     from matplotlib import pyplot
 
-    fit = lm.fit
+    fit, scanner = lm.fit, x3d_scan.default_geometry
     monkeypatch.setattr(lm, 'fit', lambda *scan, **settings: fit(*scan, **settings | {'iterations': 20}))
+    monkeypatch.setattr(x3d_scan, 'default_geometry', lambda phantom, angles, pixels: scanner(phantom, angles, 128))
     monkeypatch.chdir(tmp_path)
     pyplot.close('all')
     with warnings.catch_warnings(), np.printoptions():  # which ODL changes for good

@@ -23,7 +23,7 @@ def checkpoint(tmp_path_factory):
     return path
 
 
-def test_a_result_without_a_scan(checkpoint, tmp_path):
+def test_a_result_without_a_scan(checkpoint, tmp_path, no_report):
     fit = Fit.load(checkpoint)
     found = json.loads((fit.save(tmp_path / 'out') / 'metrics.json').read_text())
     assert Fit.load(tmp_path / 'out').record == found
@@ -61,7 +61,7 @@ def test_the_held_out_views_of_the_summary_are_absolute(checkpoint):
     assert numbers['ssim_2d'] != numbers['ssim_2d_r2']
 
 
-def test_a_result_with_what_it_is_compared_with(checkpoint, tmp_path):
+def test_a_result_with_what_it_is_compared_with(checkpoint, tmp_path, no_report):
     folder = compared(checkpoint).save(tmp_path / 'out', title='itself', note=dict(command='fit'))
     found = json.loads((folder / 'metrics.json').read_text())
     assert found['ssim_3d'] == pytest.approx(1) and found['psnr_2d'] > 0 and len(found['test_angles']) == 2

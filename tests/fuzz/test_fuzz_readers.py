@@ -32,7 +32,7 @@ def test_the_good_files_are_read(tmp_path, name):
 
 
 @pytest.mark.parametrize('name', CHEAP)
-@settings(max_examples=25, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=15, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(rng=st.randoms(use_true_random=False))
 def test_mutated_files_in_this_process(tmp_path, name, rng):
     assert verdict(name, tmp_path, rng) in ('value', 'refused')

@@ -36,7 +36,9 @@ def foot():
         pytest.param('gaussians', marks=pytest.mark.slow),
     ],
 )
-@pytest.mark.parametrize(('total', 'views'), [(360, 10), (360, 25), (180, 25), (220, 60)])
+@pytest.mark.parametrize(
+    ('total', 'views'), [(360, 10), pytest.param(360, 25, marks=pytest.mark.thorough), (180, 25), (220, 60)]
+)
 def test_a_sound_scan_raises_no_alarm(name, mode, total, views):
     assert advised(scanned(name, mode, views, total)) == []
 

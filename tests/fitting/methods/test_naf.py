@@ -55,7 +55,7 @@ def test_it_learns_the_object(learnt):
     assert fitted.volume().sum(dtype=float) * 8**3 == pytest.approx(mass, rel=0.03)
 
 
-@pytest.mark.parametrize('factor', [0.02, 50])
+@pytest.mark.parametrize('factor', [pytest.param(0.02, marks=pytest.mark.thorough), 50])
 def test_it_learns_densities_of_any_unit(factor, learnt):
     """Of matter, about 0.02 per mm; and beyond 1, which the published form cannot reach."""
     scan, fitted = learnt
