@@ -139,7 +139,7 @@ def test_views_say_nothing_behind_invalid_pixels(scan, outside, misses):
     assert not (found.low | found.high)[~valid].any() and found.high[valid].any() and not found.high[valid].all()
     expected = masks(np.where(valid, scan.projections, np.nan)[0][valid[0]][None, None] * g.grid.scale, 0.1)
     assert found.t_high[0] == expected.t_high[0]  # the threshold of the valid pixels alone
-    frames, grid = g.normalised_rays(), (9, 9, 9)
+    frames, grid = g.normalised_rays(), (8, 8, 8)
     low, high = valid_voxels(frames, found, grid, g.grid.half, misses, outside)
     np.testing.assert_array_equal(low, brute_force(frames, found, voxel_centres(grid, g.grid.half), misses, outside))
     assert len(low) > len(valid_voxels(frames, masks(scan.projections * valid), grid, g.grid.half, misses, outside)[0])

@@ -1,6 +1,7 @@
 """Fitted Gaussians with densities, in other geometries than that of their scan."""
 
 from dataclasses import replace
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -8,6 +9,7 @@ import pytest
 from helpers.fits import SHORT, geometry, tiny_scan
 from lingo_mi.fitting.loop import run
 from lingo_mi.fitting.methods.r2 import R2
+from lingo_mi.fitting.models import density
 from lingo_mi.fitting.view_loss import MeasuredView
 from lingo_mi.functional import voxelize
 from lingo_mi.geometry.grid import Grid
@@ -73,7 +75,10 @@ def test_a_large_volume_is_made_in_slabs(monkeypatch, scene):
     result = lm.fit(lm.simulate(scene), 'fast', iterations=10, n_points=100, progress=False)
     grids = None, Grid((20, 30, 17), (1.1, 0.8, 0.9))
     whole = [result.volume(grid) for grid in grids]
-    monkeypatch.setattr('lingo_mi.fitting.models.density.AT_ONCE', 24 * 24 * 12)
+    monkeypatch.setattr(density, 'AT_ONCE', 24 * 24 * 12)
+    slabs = mock.Mock(side_effect=density.voxelize)
+    monkeypatch.setattr(density, 'voxelize', slabs)
     for grid, want in zip(grids, whole):
         found = result.volume(grid)
         assert found.shape == want.shape and abs(found - want).max() < 2e-6 * want.max() and want.max() > 0
+    assert slabs.call_count == 8 + 9  # of 3 and of 2 slices each
