@@ -158,13 +158,16 @@ def test_two_stage(scene, dataset, fitted, tmp_path):
 
 
 def test_voxelize(scene, dataset, fitted, tmp_path):
-    code, text, err = run(
-        RECONSTRUCT, scene, '--algorithm', 'voxelize', '--complete', fitted, '--out', tmp_path / 'v.nii'
-    )
+    """At once, and in slabs."""
+    command = RECONSTRUCT, scene, '--algorithm', 'voxelize', '--complete', fitted, '--out'
+    code, text, err = run(*command, tmp_path / 'v.nii')
     assert code == 0, err
     result = load(fitted.with_name('volume.nii.gz'))
     assert np.linalg.norm(load(tmp_path / 'v.nii') - result) < 1e-4 * np.linalg.norm(result)
     assert 'voxelize of a fit to 4 views' in text
+    code, text, err = run(*command, tmp_path / 'slabs.nii', '--slab', 9)
+    assert code == 0 and 'voxels in slabs of 9 slices' in text, err
+    np.testing.assert_allclose(load(tmp_path / 'slabs.nii'), load(tmp_path / 'v.nii'), atol=1e-5 * result.max())
 
 
 def test_start(scene, dataset, fitted, tmp_path):
