@@ -24,7 +24,7 @@ class PixelEffects(Protocol):
         ...
 
     def binned(self, pixels: int) -> Any:
-        """The same effects on a panel of which that many pixels became one."""
+        """The same effects after binning the panel by that many pixels."""
         ...
 
 
@@ -125,7 +125,7 @@ class Scan:
     def binned(self, factor: int) -> Scan:
         """The same views with `factor` x `factor` pixels averaged into one; rows and columns left over are dropped.
 
-        A side of fewer than two new pixels is not binned. Pixels of which one is not valid, or dead, are not valid.
+        A side of fewer than two new pixels is not binned. A new pixel is not valid if one of its pixels is dead or not valid.
         """
         geometry, by = self.geometry.binned(factor), self.geometry.bins(factor)
         rows, columns = geometry.nDetector
@@ -212,7 +212,7 @@ def values_digest(volume: np.ndarray) -> str:
 class Dataset:
     """What a file of a scan may hold: views to fit, views held out, and the true volume [x, y, z], densities in 1/mm.
 
-    The volume may be an array of any library that has `__array__` or `__dlpack__`; InputError where it is none.
+    The volume may be an array of any library that has `__array__` or `__dlpack__`; InputError if it is none.
 
     Examples
     --------

@@ -29,7 +29,7 @@ class CTDetector(mi.Film):
        - Standard deviation of the read-out noise, in photons. Needs `photons`. (Default: 0)
      * - response
        - |string|
-       - `energy`: the signal is the energy of the photons, as of a scintillator; `count`: their number.
+       - `energy`: the signal is the energy of the photons, as for a scintillator; `count`: their number.
          (Default: energy)
      * - psf
        - |float|
@@ -58,7 +58,7 @@ class CTDetector(mi.Film):
        - Whether gains are divided out and dead pixels filled from their neighbours, as scanners do. (Default: true)
 
     Put it into a `ct_scanner`, whose pixels it takes, or into a camera with a width and a height of its own. `lingo_xray`
-    renders it, noise included: its seed is that of `mi.render`, and the same seed and view give the same noise in any
+    renders it, noise included: its seed is the seed of `mi.render`, and the same seed and view give the same noise in any
     order. Derivatives are those of the expected signal. Other integrators get an ordinary film (`hdrfilm`, box filter).
     """
 

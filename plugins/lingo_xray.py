@@ -73,7 +73,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
 
     An emitter `xray_tube` (spectrum, focal spot) and a film `ct_detector` (blur, noise and more) make the image what a
     detector sees, -ln of the detected signal; docs/effects.md says how. Without them, nothing of their code is compiled.
-    The seed of `mi.render` is that of the noise, and derivatives are those of the expected signal.
+    The seed of `mi.render` seeds the noise. Derivatives belong to the expected signal.
 
     Objects overlap additively. A kind of object that a scene lacks adds no code to its kernels. Rays are those of pixel
     centres (see `pixel`): no random numbers, whatever the sample count. Sensors: `ct_scanner`,

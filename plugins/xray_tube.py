@@ -42,7 +42,7 @@ class XRayTube(mi.Emitter):
          one's share in the density of every Gaussian, 0 to 1.
      * - material_NAME
        - |string|
-       - The material of the shape whose id is NAME, where it is another.
+       - The material of the shape whose id is NAME, if it is another.
      * - split
        - |string|
        - "0.024, 0.040": densities, 1/mm, up to which a voxel is the first of two materials, and from which it is the
@@ -57,7 +57,7 @@ class XRayTube(mi.Emitter):
          rectangle parallel to the panel. (Default: 0, a point)
      * - focal_order
        - |int|
-       - n of n x n Gauss-Legendre points on it, 1 to 16, each of which is a projection. (Default: 3)
+       - n of n x n Gauss-Legendre points on it, 1 to 16; each point is a projection. (Default: 3)
      * - scatter
        - |int|
        - Paths of scattered photons, of each energy, that are traced to every point of a coarse grid on the panel. Needs
@@ -80,7 +80,7 @@ class XRayTube(mi.Emitter):
      * - scatter_box
        - |string|
        - "x0, y0, z0, x1, y1, z1": the lowest and the highest corner, mm, of a box outside which nothing scatters.
-         (Default: that of all objects, Gaussians out to 4 standard deviations)
+         (Default: the box of all objects, Gaussians out to 4 standard deviations)
      * - scatter_seed
        - |int|
        - Of its random numbers. (Default: 0)

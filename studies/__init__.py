@@ -7,7 +7,7 @@ Each is a command, `python -m studies.NAME --help`:
 - `bench_recon`: reconstruction on voxels, timed beside RTK and diffct
 - `bench_step`: a step of a fit, timed part by part
 - `box_voxels`: a scan of voxels that are boxes
-- `cuda_check`: the CUDA backend where there is no GPU
+- `cuda_check`: the CUDA backend if there is no GPU
 - `effects`: what modelling an effect of real projections is worth
 - `explain`: which errors of a scanner explain the error of a reconstruction
 - `fuzz`: mutated files for every reader

@@ -16,7 +16,7 @@ from lingo_mi.storage.file_access import write_text
 
 
 class CellFiles:
-    """The cells below a folder. needed: keys without which a file is no cell."""
+    """The cells below a folder. needed: keys without which a file is not a cell."""
 
     def __init__(self, folder: Path, *needed: str):
         self.folder, self.needed = Path(folder), needed
@@ -25,7 +25,7 @@ class CellFiles:
         return self.folder / case / f'{setting}.json'
 
     def get(self, case: str, setting: str) -> dict | None:
-        """A stored cell, or None where there is none that can be read."""
+        """A stored cell, or None if there is none that can be read."""
         try:
             cell = json.loads(self.path(case, setting).read_text(encoding='utf-8'))
         except (OSError, ValueError):

@@ -25,18 +25,18 @@ _TERMS = dict(
 
 @dataclass(frozen=True)
 class Calibration:
-    """What `lm.calibrate` has found; `corrected` is the scan with it.
+    """The result of `lm.calibrate`. `corrected` applies it to a scan.
 
     Parameters
     ----------
     geometry : Geometry
-        Of the scan that was given.
+        The geometry of the scan before the calibration.
     found : SearchResult
         Numbers, their standard errors, and how well views predict each other before and after.
     air : Air or None
         The air level that was read beside the object and taken out first; None if none was.
     notes : tuple[str, ...]
-        Sentences on what the scan does not tell.
+        Sentences on what the scan does not determine.
     """
 
     geometry: Geometry
@@ -46,7 +46,7 @@ class Calibration:
 
     @property
     def needed(self) -> bool:
-        """Whether anything was found that is taken."""
+        """Whether there is anything to correct."""
         drift = self.found.drift
         moved = any(drift.u) or any(drift.v) or bool(drift.yaw)
         return moved or self._response is not None or self.air is not None
@@ -64,9 +64,10 @@ class Calibration:
     def corrected(self, scan: Dataset) -> Dataset: ...
 
     def corrected(self, scan: Scan | Dataset) -> Scan | Dataset:
-        """The same views with the panel where it was found. Views that were held out get what was found for their time, which
-        their angles tell: the scan's views must be in the order in which they were taken. An air level that was read beside the
-        object is read there again, in each view for itself.
+        """The same views with the measured position of the panel.
+
+        Held-out views get the correction for their time, which follows from their angles: the views of the scan must be in the
+        order in which they were taken. An air level that was read beside the object is read again in each view.
 
         Raises
         ------
@@ -81,7 +82,7 @@ class Calibration:
 
     def _moved(self, scan: Scan) -> Scan:
         if scan.geometry.mode != self.geometry.mode or scan.geometry.nDetector != self.geometry.nDetector:
-            raise InputError('this calibration is that of a scan by another scanner: calibrate this one')
+            raise InputError('this calibration belongs to a scan by another scanner: calibrate this one')
         if not self.needed:
             return scan
         response = self._response

@@ -2,11 +2,11 @@
 
 Every view is predicted from a quick reconstruction of other views (`cross_prediction`). With r the differences to what was
 measured, as a function of the numbers sought, and D the derivatives of r by differences (of the whole chain, each with two
-reconstructions of its own), a step is that of Gauss and Newton, -(D D^T)^-1 D r. The shift along u is first looked for on
+reconstructions of its own), a step is a Gauss-Newton step, -(D D^T)^-1 D r. The shift along u is first looked for on
 a grid of trials, a wide one where no minimum is clear.
 
 The panel moves, and the images stay as they were measured. So all pixels count in all trials: if images were moved instead, those
-of an object that reaches over the panel's edge would lose or gain pixels, and the smallest sum would be that of the fewest.
+of an object that reaches over the panel's edge would lose or gain pixels, and the smallest sum would have the fewest.
 
 Standard errors are those of clustered observations,
 
@@ -36,12 +36,12 @@ FIRST, FINE = 32, (32, 48)  # columns of the binned panel: for trials, and for o
 MOST_VIEWS = 60
 REACH, FARTHEST = 0.06, 0.5  # of the panel's width: how far off an axis is looked for at first, and at most
 TRIAL = 0.6 / FIRST  # of the panel's width: between trials
-CLEAR = 0.5  # of the largest sum of squares among the trials: a smallest one above it is no minimum
+CLEAR = 0.5  # of the largest sum of squares among the trials: a smallest one above it is not a minimum
 SINGULAR = 1e-12  # of the largest eigenvalue of the normal equations
 LONGEST = 4.0  # steps for differences that a number may change by at a time
 AGAIN = 3  # steps more, at most, with the derivatives of the last: until they are within the standard errors
 SPANS = 6  # of the scan's time, for standard errors
-FLOOR = 0.03  # of a step for differences: no standard error is smaller, since voxels are no object
+FLOOR = 0.03  # of a step for differences: no standard error is smaller, since voxels are not the object
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class SearchResult:
     drift : Drift
         The panel's place over the scan; a number that is not taken is 0 in it.
     response : Response or None
-        Of the detector, likewise; None if none was sought.
+        Response of the detector, likewise; None if none was sought.
     measured : dict[str, float]
         All numbers as measured, by name, as `Drift.of` (mm, radians) and `Response.changed` have them.
     errors : dict[str, float]
@@ -110,7 +110,7 @@ class _Level:
         return np.array(derivatives)
 
     def stepped(self, here: dict[str, float], r: np.ndarray, D: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
-        """A step of limited length, or half of it, or none: where the differences are smaller; and these."""
+        """A step of limited length, half of it, or none, whichever has smaller differences; and these."""
         step = _step(r, D)
         step = step / max(max(abs(s) / (LONGEST * self.steps[name]) for s, name in zip(step, self.names)), 1.0)
         for share in (1.0, 0.5):
@@ -129,9 +129,9 @@ def search(
     Parameters
     ----------
     degree : int
-        Of the drift's polynomial in time; 0: no drift.
+        Degree of the drift's polynomial in time; 0: no drift.
     response : Response or None
-        Of the scan's geometry, with the parts that are sought; None: projections are line integrals.
+        Response of the scan's geometry, with the parts that are sought; None: projections are line integrals.
     progress : callable or None
         Called as progress(trials done, trials) after every quick reconstruction.
 

@@ -36,7 +36,7 @@ def parser() -> Parser:
         type=int,
         default=0,
         metavar='K',
-        help='also a curve of K coefficients from line integral to measured value, as of beam hardening',
+        help='also a curve of K coefficients from line integral to measured value, as for beam hardening',
     )
     p.add_argument('--scatter', action='store_true', help='also scattered light, one smooth image for all views')
     p.add_argument(

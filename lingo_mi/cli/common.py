@@ -195,7 +195,7 @@ def spacing_argument(parser: argparse.ArgumentParser, of: str) -> None:
 
 
 def check_input(args: argparse.Namespace) -> None:
-    """Raises InputError where the arguments of `input_arguments` and --views contradict each other.
+    """Raises InputError if the arguments of `input_arguments` and --views contradict each other.
 
     A scan in the place of the scene becomes --projections, with a scanner that has no effects.
     """
@@ -223,7 +223,7 @@ def check_input(args: argparse.Namespace) -> None:
 
 
 def units_of(args: argparse.Namespace) -> dict[str, Any]:
-    """The `units` and `mu_water` of what is written; --mu-water may be that of a --volume."""
+    """The `units` and `mu_water` of what is written; --mu-water may belong to a --volume."""
     return dict(units=args.units, mu_water=args.mu_water if args.units == 'hu' else None)
 
 
@@ -249,7 +249,7 @@ def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: in
     views : int or None
         How many evenly spaced views to use (None: all).
     seed : int
-        Of the noise, where the scene's detector has any.
+        Seed of the noise, if the scene's detector has any.
     slab : int
         Slices of the volume that are in memory at once (0: all; else there is no true volume).
     """
@@ -374,7 +374,7 @@ def docs_of(args: argparse.Namespace) -> tuple[Path | None, Path]:
     Raises
     ------
     InputError
-        If --docs is no folder, or where the results in --out might overwrite the page.
+        If --docs is not a folder, or if the results in --out might overwrite the page.
     """
     document, figures = args.document, args.figures or args.out
     if args.docs is not None:

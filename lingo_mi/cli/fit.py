@@ -126,7 +126,7 @@ def fit_scene(folder: Path, args: argparse.Namespace, method: Method, parameters
     Parameters
     ----------
     parameters : dict[str, str]
-        Of the scene file.
+        Parameters of the scene file.
     """
     from lingo_mi.api.fitting import fit
     from lingo_mi.fitting.measure import summary

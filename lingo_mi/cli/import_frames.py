@@ -54,7 +54,7 @@ def parser() -> Parser:
     add(
         '--exposure',
         metavar='X',
-        help='exposure of the views over that of the flats: a number, or a file with one a line',
+        help='exposure of the views over the exposure of the flats: a number, or a file with one a line',
     )
     add(
         '--saturation',

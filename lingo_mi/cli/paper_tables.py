@@ -94,7 +94,7 @@ def make_tables(
     tables : Sequence[str]
         Names of `report.TITLES`.
     name : str
-        Of the scale.
+        Name of the scale.
     objects : Sequence[str]
         Names of objects, or of the scans in scale.data.
 
@@ -124,7 +124,7 @@ def make_tables(
         if not plan(rows[table], objects):
             raise InputError(
                 f'{" and ".join(args.algorithms)} cannot make a volume of {" and ".join(args.methods)}: opacities '
-                'are no densities; add other --algorithms or --methods'
+                'are not densities; add other --algorithms or --methods'
             )
     with locked(folder):
         failed = [failure for table in tables for failure in _make(args, table, every, rows[table], objects, name)]

@@ -23,7 +23,7 @@ Beam hardening and scatter that the scene's tube names are taken out of the proj
 with --complete and --start, those that the fit has modelled.
 
 A volume larger than memory is made and written in slabs of --slab slices, by fdk, sart, os-sart, sirt and voxelize. The iterative
-ones hold it in a folder beside it, whose name is that of the volume and .slabs, until it is written. If they are stopped, the
+ones hold it in a folder beside it, with the name of the volume and .slabs, until it is written. If they are stopped, the
 same command goes on. With --cluster, workers make the slabs and write them to an .ome.zarr; they must see its folder.
 """
 
@@ -118,7 +118,7 @@ def parser() -> Parser:
         '--seed',
         type=int,
         metavar='N',
-        help="of a simulated detector's noise (default: 0; with --complete and --start that of the fit)",
+        help="of a simulated detector's noise (default: 0; with --complete and --start the seed of the fit)",
     )
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     p.add_argument(

@@ -22,7 +22,7 @@ def as_numpy(values: Any, name: str, dtype: DTypeLike | None = None) -> np.ndarr
     name : str
         What they are, for messages.
     dtype : DTypeLike or None
-        Of the result; default: their own.
+        Type of the result; default: their own.
 
     Raises
     ------

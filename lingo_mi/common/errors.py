@@ -45,16 +45,16 @@ class InputError(ValueError):
 
 
 class AccuracyWarning(UserWarning):
-    """Float32 cannot give this result to the usual digits. The message says why, and about how many are left."""
+    """Warns that float32 gives this result with fewer digits than usual. The message says why, and how many digits are left."""
 
 
 def require_type(name: str, value: object, kinds: type | tuple[type, ...], remedy: str = '') -> None:
-    """Raises InputError unless `value` is of one of `kinds`.
+    """Raise InputError unless `value` is an instance of one of `kinds`.
 
     Parameters
     ----------
     name : str
-        Of the argument, for the message.
+        Name of the argument, for the message.
     remedy : str
         What to do, for the message.
 

@@ -35,9 +35,9 @@ class GPU:
     capability : int
         Compute capability times ten: 86, 90.
     clock : float
-        Of the multiprocessors, Hz; 0 where the driver does not say, as the next.
+        Clock rate of the multiprocessors, Hz; 0 if the driver does not tell, as below.
     bandwidth : float
-        Of the memory, bytes a second.
+        Bandwidth of the memory, bytes a second.
     """
 
     name: str
@@ -94,7 +94,7 @@ def resident_warps() -> int:
 
 
 def visible_gpus() -> list[str]:
-    """The GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them; none where there is no driver."""
+    """The GPUs that this process may use, as CUDA_VISIBLE_DEVICES names them; none if there is no driver."""
     named = os.environ.get('CUDA_VISIBLE_DEVICES')
     if named is not None:
         return [name for name in named.split(',') if name.strip()]

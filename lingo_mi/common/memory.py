@@ -1,6 +1,6 @@
 """How much memory this process may take for the arrays that it computes on.
 
-psutil knows the memory of the machine on every system, but in a container the limit is that of the control group.
+psutil knows the memory of the machine on every system, but in a container the control group sets the limit.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def require_room(needed: float, where: PathLike | str) -> None:
 
 
 def _control_groups(groups: Path = Path('/proc/self/cgroup'), mounted: Path = Path('/sys/fs/cgroup')) -> list[float]:
-    """The limits of this process's control groups, v1 and v2, and of those around them, where they can be read."""
+    """The limits of this process's control groups, v1 and v2, and of those around them, if they can be read."""
     out = []
     try:
         lines = groups.read_text(encoding='utf-8').splitlines()

@@ -31,9 +31,9 @@ def frames(
     Parameters
     ----------
     labels : Sequence[str]
-        Of the images, n.
+        Labels of the images, n.
     title : str
-        Of the figure.
+        Title of the figure.
     start : int or None
         The image that is seen first (default: the one in the middle).
     window : tuple[float, float] or None
@@ -100,7 +100,7 @@ def slices(volume: np.ndarray, spacing: ArrayLike, centre: ArrayLike = (0, 0, 0)
 def grey_range(*arrays: np.ndarray) -> tuple[float, float]:
     """A common grey scale, by the last array: from 0, or from the 0.1th percentile where that is negative, to the 99.9th.
 
-    Where few values are not 0, to the largest of all arrays.
+    If few values are not 0, to the largest of all arrays.
     """
     reference = arrays[-1]
     low, high = min(0.0, float(np.percentile(reference, 0.1))), float(np.percentile(reference, 99.9))

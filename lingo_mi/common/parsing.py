@@ -125,7 +125,7 @@ def require_ranges(part: Any, **ranges: tuple[float, float]) -> None:
 
 
 def nearest(name: str, names: Iterable[str]) -> str:
-    """', did you mean ...?' of the known name nearest to a misspelt one, for messages; empty where none is near."""
+    """', did you mean ...?' with the nearest of the names to a misspelt one, for messages; empty if none is near."""
     near = difflib.get_close_matches(name, list(names), 1)
     return f', did you mean {near[0]}?' if near else ''
 

@@ -35,10 +35,10 @@ _LOCK = threading.RLock()
 
 @contextmanager
 def drjit_lock() -> Iterator[None]:
-    """Holds up other threads: recorded kernels serve one at a time, and two threads in Dr.Jit may wait for each other for ever.
+    """Lock Dr.Jit for this thread: recorded kernels serve one thread, and two threads in Dr.Jit may wait for each other for ever.
 
-    Tells Dr.Jit of a thread that goes on with another's arrays: PyTorch goes back through a graph on a GPU in a thread of its
-    own. Also a decorator: `@drjit_lock()`.
+    It also tells Dr.Jit of a thread that goes on with the arrays of another one: on a GPU, PyTorch goes back through a graph in
+    its own thread. It is also a decorator: `@drjit_lock()`.
     """
     import drjit as dr
 
@@ -55,7 +55,7 @@ def cores() -> int:
 
 
 def use_threads(number: int) -> None:
-    """Let Dr.Jit run its kernels on the CPU in so many threads.
+    """Set the number of threads in which Dr.Jit runs its kernels on the CPU.
 
     `dr.set_thread_count` alone crashes the process while a kernel runs that adds to a copy of its result for every thread.
     """
@@ -68,7 +68,7 @@ def use_threads(number: int) -> None:
 def find_libllvm() -> str | None:
     """Point DRJIT_LIBLLVM_PATH at the newest LLVM that the environment carries, unless the user has set it.
 
-    It goes before the system's, which may be too old for Dr.Jit. Returns the path in use, or None where only Dr.Jit's own search
+    It goes before the system's, which may be too old for Dr.Jit. Returns the path in use, or None if only Dr.Jit's own search
     of the system is left.
     """
     if os.environ.get('DRJIT_LIBLLVM_PATH'):
@@ -86,7 +86,7 @@ def find_libllvm() -> str | None:
 
 
 def _numbers(path: str) -> list[int]:
-    """The version in the name of a library; where there is none, the oldest that works."""
+    """The version in the name of a library; if there is none, the oldest that works."""
     return [int(number) for number in re.findall(r'\d+', os.path.basename(path))] or [OLDEST_LLVM]
 
 
@@ -105,7 +105,7 @@ def calm_openmp() -> None:
 
 @cache
 def warn_of_spinning() -> None:
-    """Warn, once, where PyTorch was loaded before `calm_openmp` could help."""
+    """Warn, once, if PyTorch was loaded before `calm_openmp` could help."""
     if _POLICY not in os.environ:
         warnings.warn(
             "PyTorch's threads spin while Dr.Jit works, and slow it down: import lingo_mi before torch, or set the environment "
@@ -115,7 +115,7 @@ def warn_of_spinning() -> None:
 
 
 def restart_llvm() -> None:
-    """Where Dr.Jit was imported before us and took an LLVM that cannot work, restart it on the bundled one.
+    """Restart Dr.Jit on the bundled LLVM if it was imported before us and took an LLVM that cannot work.
 
     Dr.Jit loads LLVM as soon as it is imported, so that `import mitsuba` before `import lingo_mi` meets a system LLVM first.
     Restarting would lose the user's arrays: with any alive, a warning says what to do instead. (Mitsuba's own constants, the

@@ -38,7 +38,7 @@ def fitted_views(scan: Scan, geometry: Geometry) -> Scan:
     there, wanted = _corners(scan.geometry, reach), _corners(geometry, reach)
     allowed = 0.01 * min(scan.geometry.dDetector)
     missing = InputError(
-        f'the fit saw {len(geometry)} views, not all of which are among the '
+        f'the fit saw {len(geometry)} views, but not all of them are among the '
         f'{len(scan)} of this scan: give the scan that it was fitted to'
     )
     if len(scan) < len(geometry) or scan.geometry.mode != geometry.mode:

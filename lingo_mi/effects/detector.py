@@ -111,7 +111,7 @@ class Detector:
         return replace(self, photons=0.0, electronic_noise=0.0, bits=0, dead=0.0, gain=gain, corrected=True)
 
     def binned(self, pixels: int) -> Detector:
-        """The detector of which that many pixels became one: their photons and noise, without dead pixels and gains."""
+        """The detector after binning by that many pixels: their photons and noise, without dead pixels and gains."""
         noise = self.electronic_noise * pixels**0.5
         bits = self.bits and self.bits + round(math.log2(pixels**0.5))  # a mean of n is rounded sqrt(n) times as finely
         return replace(self, photons=self.photons * pixels, electronic_noise=noise, bits=bits, dead=0.0, gain=0.0)

@@ -30,7 +30,7 @@ class Effects:
     tube, spot, scatter
         Spectrum, focal spot and scattered photons of its `xray_tube`.
     detector : Detector or None
-        Of the sensor's `ct_detector`.
+        Detector of the sensor, from its `ct_detector`.
     index : int
         The sensor's view: with the seeds, the key of its noise.
     """
@@ -99,7 +99,7 @@ class Effects:
         Parameters
         ----------
         objects : list
-            Of `projectors.objects.find_objects`.
+            Objects, as `projectors.objects.find_objects` gives them.
         options : RenderOptions
             Its n x n rays per pixel are averaged as intensities; a detector with an `aperture` has points of its own in every
             pixel.
@@ -175,7 +175,7 @@ class Effects:
         return replace(scan, valid=valid & alive)
 
     def binned(self, pixels: int) -> Effects:
-        """The effects of a panel of which that many pixels became one, dead ones left out."""
+        """The effects after binning by that many pixels, which leaves dead pixels out."""
         return replace(self, detector=self.detector and self.detector.binned(pixels))
 
     def without_hardening(self, projections: np.ndarray) -> np.ndarray:
@@ -198,7 +198,7 @@ class Effects:
 
 
 def effects_of(scan: Scan) -> Effects | None:
-    """A scan's effects, of which `scan`, in a package below this one, knows only two methods."""
+    """The effects of a scan. `scan`, in a package below this one, knows only two of their methods."""
     return cast('Effects | None', scan.effects)
 
 

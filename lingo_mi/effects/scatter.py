@@ -123,7 +123,7 @@ class Scatter:
         Parameters
         ----------
         objects : list
-            Of `projectors.objects.find_objects`.
+            Objects, as `projectors.objects.find_objects` gives them.
         tube : Tube
             `hardening.Tube` with the objects' materials.
         response : str

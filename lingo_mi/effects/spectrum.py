@@ -82,7 +82,7 @@ def tube_spectrum(kvp: float, angle: float = 12.0, filtration: str = 'Al 2.5') -
     kvp : float
         Peak voltage, kV, 20 to 300.
     angle : float
-        Of the anode, degrees, above 0 and below 90.
+        Angle of the anode, degrees, above 0 and below 90.
     filtration : str
         'Al 2.5, Cu 0.1': materials and thicknesses in mm; may be empty.
 

@@ -54,7 +54,7 @@ def write_dicom(path: Path, grid: Grid, slabs: Iterable[tuple[int, np.ndarray]],
 
 
 def require_hounsfield(path: Path, unit: Unit) -> None:
-    """Raises InputError unless the unit is that of DICOM's CT images."""
+    """Raises InputError unless DICOM's CT images have this unit."""
     if unit.name != 'hu':
         raise InputError(
             f"{path}: CT images of DICOM are in Hounsfield units: give units='hu' and mu_water=MU, water's per mm"

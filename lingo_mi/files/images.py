@@ -92,7 +92,7 @@ def _shape(header: bytes, path: PathLike | str) -> tuple[tuple[int, int], int]:
     try:
         magic, version = struct.unpack_from('<ii', header)
         if magic != 20000630 or version & _NO_SCAN_LINES:
-            raise InputError(f'{path}: is no OpenEXR file of one image in scan lines; write it again')
+            raise InputError(f'{path}: is not an OpenEXR file of one image in scan lines; write it again')
         at = 8
         while header[at]:
             end = header.index(0, at)

@@ -167,7 +167,7 @@ class _Header:
         return [int(x) for x in values]
 
     def choice(self, choices: dict[str, Any], name: str, text: str) -> Any:
-        """The choice that the text of a field names. The message lists one name of each choice."""
+        """The choice that the text of a field names. The message of the error lists one name of each choice."""
         if text not in choices:
             names = {choice: name for name, choice in reversed(choices.items())}
             self.refuse(f'{name} must be one of {", ".join(reversed(names.values()))}, not {shown(text)}')

@@ -91,7 +91,7 @@ def _attributes(path):
             attributes = attributes.get(key) if key else attributes
             if isinstance(attributes, dict):
                 return attributes
-    raise InputError(f'{path}: is no Zarr group; give the folder that holds zarr.json or .zattrs')
+    raise InputError(f'{path}: is not a Zarr group; give the folder that holds zarr.json or .zattrs')
 
 
 def _json(path, file):

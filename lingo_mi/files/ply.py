@@ -59,7 +59,7 @@ def check_cloud(
     density: np.ndarray,
     name: str = 'density',
 ) -> None:
-    """Raises InputError unless these are N Gaussians, as of `write_ply`. name: what the message calls the density."""
+    """Raises InputError unless these are N Gaussians, as for `write_ply`. name: what the message calls the density."""
     n = len(density)
     if n == 0:
         raise InputError(f'{where}: the cloud is empty; at least one Gaussian is needed')
@@ -236,7 +236,7 @@ def require_elements(path: PathLike | str) -> None:
                 elements.append([int(line[2]), 0])
             elif line[:1] == [b'property']:
                 if not elements:
-                    fail('a property is that of no element')
+                    fail('a property belongs to no element')
                 kind = _TYPES.get(line[1].decode('ascii', 'replace') if len(line) == 3 else '')
                 elements[-1][1] += 1 if kind is None or as_text else np.dtype(kind).itemsize
             elif line[:1] == [b'format']:

@@ -70,7 +70,7 @@ def read_r2(path: PathLike | str) -> Dataset:
     Returns
     -------
     Dataset
-        A Dataset; the test views and the volume are None where the folder has none.
+        A Dataset; the test views and the volume are None if the folder has none.
 
     Raises
     ------

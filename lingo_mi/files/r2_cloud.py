@@ -92,7 +92,7 @@ def write_r2_cloud(
     quaternions: np.ndarray,
     density: np.ndarray,
 ) -> None:
-    """Writes a cloud, arrays as of `read_r2_cloud`, whole or not at all: .npy without scales and quaternions, or .pickle.
+    """Writes a cloud, arrays as for `read_r2_cloud`, whole or not at all: .npy without scales and quaternions, or .pickle.
 
     Raises
     ------

@@ -429,7 +429,7 @@ def read_scan(path: PathLike | str, geometry: PathLike | str | None = None, name
     Returns
     -------
     Dataset
-        A Dataset in mm: projections [view, v, u] are line integrals; test views and volume [x, y, z] are None where the format
+        A Dataset in mm: projections [view, v, u] are line integrals; test views and volume [x, y, z] are None if the format
         has none.
 
     Raises
@@ -446,7 +446,7 @@ def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name
     Raises
     ------
     InputError
-        For what can be seen without that; arguments as of `read_scan`.
+        For what can be seen without that; arguments as for `read_scan`.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -486,7 +486,7 @@ _WRITERS = {'naf': naf.write_naf, 'r2': r2.write_r2, 'exr': _write_exr_folder, '
 
 
 def history_of(path: PathLike | str) -> Any:
-    """What a scan's geometry file says of how it was made; None where it says nothing.
+    """What a scan's geometry file says of how it was made; None if it says nothing.
 
     Raises
     ------

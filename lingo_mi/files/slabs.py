@@ -63,11 +63,11 @@ def write_slabs(path: PathLike | str, grid: Grid, slabs: Iterable[np.ndarray], u
         .nii, .nii.gz, or a new folder .ome.zarr (OME-NGFF 0.5: axes z, y, x in mm, and coarser levels by means of 2 x 2 x 2
         voxels) or .dicom (`dicom.write_dicom`).
     grid : Grid
-        Of the whole volume.
+        Grid of the whole volume.
     slabs : Iterable[ndarray]
         Densities per mm, float32 [x, y, slices], from the first slice on, together the whole volume.
     unit : Unit
-        Of the values in the file.
+        Unit of the values in the file.
 
     Raises
     ------

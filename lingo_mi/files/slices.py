@@ -54,7 +54,7 @@ def by_number(path: Path) -> list:
 
 
 def require_chain(path: Path) -> None:
-    """Raises InputError where a TIFF file's list of images goes round in circles: all of it cannot be longer than the file."""
+    """Raises InputError if a TIFF file's list of images goes round in circles: all of it cannot be longer than the file."""
     left = os.path.getsize(path)
     with open(path, 'rb') as stream:
         head = stream.read(16).ljust(16, b'\0')
@@ -78,7 +78,7 @@ def require_chain(path: Path) -> None:
 def tiff_spacing(path: Path) -> tuple[float, float, float | None] | None:
     """The voxel size (x, y, z) in mm that ImageJ or OME wrote into a TIFF file that `read_tiff_file` has read.
 
-    z is None where the file says nothing of it. Returns None for files of others: their resolution is that of a printer.
+    z is None if the file does not give it. Returns None for files of other programs: their resolution is meant for printing.
     """
     tifffile = optional('tifffile')
     try:
@@ -87,7 +87,7 @@ def tiff_spacing(path: Path) -> tuple[float, float, float | None] | None:
             sizes = _of_ome(page.description) if '<OME' in page.description[:2000] else _of_imagej(file, page)
     except InputError:
         raise
-    except Exception:  # a description of another form, of which nothing is known
+    except Exception:  # a description in another form
         return None
     steps = [size * _MILLIMETRES.get(unit.strip().lower(), math.nan) for size, unit in sizes]
     if len(steps) < 2 or not all(math.isfinite(step) and step > 0 for step in steps):

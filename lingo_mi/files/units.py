@@ -52,7 +52,7 @@ class Unit:
 
     @classmethod
     def described(cls, text: str) -> Unit | None:
-        """The unit that a file's description names; None where it names another."""
+        """The unit that a file's description names; None if it names another."""
         if match := _HU.fullmatch(text):
             return cls('hu', float(match[1]))
         return {PER_MM.description: PER_MM, 'density per cm': cls('1/cm')}.get(text)

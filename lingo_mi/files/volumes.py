@@ -152,7 +152,7 @@ def _raw(path, shape, dtype):
     try:
         dtype_text, shape = dtype, tuple(int(n) for n in shape)
         dtype = np.dtype(dtype_text)
-    except Exception:  # of a text that is no type, NumPy raises many kinds, SyntaxError among them
+    except Exception:  # for a text that is not a type, NumPy raises many kinds, SyntaxError among them
         raise InputError(
             f'{path}: shape {shown(shape)} or dtype {shown(dtype)} is not understood; give for example (256, 256, 256) '
             'and uint8'

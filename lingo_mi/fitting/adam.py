@@ -18,7 +18,7 @@ def adam_step(state: DeviceState, gradients: dict[str, Any], method: Method, ite
     Parameters
     ----------
     gradients : dict[str, Any]
-        Of the loss, by parameter.
+        Gradients of the loss, by parameter.
     iteration : int
         Counts from 0.
     """

@@ -45,7 +45,7 @@ class Checkpoint:
     method : Method
         With the limits that the scan sets.
     geometry : Geometry
-        Of the scan, as given.
+        Geometry of the scan, as given.
     unit : float
         The density that the fit counts as 1, in 1/mm.
     state : State
@@ -54,7 +54,7 @@ class Checkpoint:
         By name: `initial`, the points that the fit started from, float32 [M, 3]; `order`, the views that come next;
         `losses`, those of the last pass; the mean of the last steps; and those of the corrections.
     seed : int
-        Of all random choices.
+        Seed of all random choices.
     rng : dict
         State of the generator of the views' order, the total variation's cubes and splits.
     iteration : int
@@ -190,14 +190,14 @@ def _read(path: PathLike | str) -> dict[str, np.ndarray]:
 
 
 def _text(array: np.ndarray) -> str:
-    """The text in an array of one. Raises InputError where there is none."""
+    """The text in an array of one. Raises InputError if there is none."""
     if array.ndim or array.dtype.kind != 'U':
         raise InputError('extra and checksum must be texts')
     return array.item()
 
 
 def _array(file: io.BufferedReader, entry: zipfile.ZipInfo) -> np.ndarray:
-    """The array in an entry, writable, from the file straight into its memory. Raises InputError where the entry's check sum is
+    """The array in an entry, writable, from the file straight into its memory. Raises InputError if the entry's check sum is
     wrong, or its header claims another size than it has, or objects."""
     file.seek(entry.header_offset + 26)  # where the lengths stand of what goes before the content
     name, more = struct.unpack('<HH', file.read(4))

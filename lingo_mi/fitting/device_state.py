@@ -50,7 +50,7 @@ class DeviceState:
 
     def finite(self) -> bool:
         """Whether all parameters are finite; waits for the device."""
-        totals: dict[int, Any] = {}  # by width: that of all Gaussians' parameters is the same
+        totals: dict[int, Any] = {}  # by width: all parameters of the Gaussians have the same
         for x in self.values.values():
             total = x if isinstance(x, mi.Float) else dr.sum(x)
             totals[dr.width(total)] = totals.get(dr.width(total), 0) + total

@@ -157,7 +157,7 @@ class Fit(FittedModel):
         path : path
             .nii, .nii.gz, a new .ome.zarr, or a new folder .dicom; its folder is made.
         grid : Grid, optional
-            Of the voxels (default: the scan's); `scan.geometry.grid.finer(2)` has smaller ones.
+            Grid of the voxels (default: the scan's); `scan.geometry.grid.finer(2)` has smaller ones.
         units, mu_water
             Of the values in the file: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm.
         slab : int
@@ -210,7 +210,7 @@ class Fit(FittedModel):
         folder : path
             Is made if it is missing.
         title : str
-            Of the report (default: the folder's name).
+            Title of the report (default: the folder's name).
         units, mu_water
             Of the values in volume.nii.gz: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm.
         force : bool
@@ -282,7 +282,7 @@ class Fit(FittedModel):
         Parameters
         ----------
         title : str
-            Of the page (default: the method's name).
+            Title of the page (default: the method's name).
         """
         return Page(report_page(self.report(title)))
 

@@ -144,7 +144,7 @@ class FittedModel:
 
     @cached_property
     def scan_volume(self) -> np.ndarray:
-        """`volume` on the scan's grid, computed once, for all that measures, shows and saves it: not to be written to."""
+        """`volume` on the scan's grid, computed once for all that measures, shows and saves it. Do not write to it."""
         return self.volume()
 
     @drjit_lock()

@@ -49,7 +49,7 @@ def run(
     method : Method
         How.
     seed : int
-        Of all random choices.
+        Seed of all random choices.
     measure : callable, optional
         Called as measure(fit) at a few iterations; returns numbers for the history. Not in a search for the step to stop at.
     progress : callable, optional
@@ -154,13 +154,13 @@ class Running:
     Attributes
     ----------
     method : Method
-        Of the whole fit, with the limits that the scan sets.
+        Method of the whole fit, with the limits that the scan sets.
     stepper : Stepper
         The optimisation on the views that it sees.
     state : DeviceState
         After the last step.
     average : Average
-        Of the states.
+        Average of the states.
     rng : Generator
         Of the views' order, the total variation's cubes and splits.
     order : list of int

@@ -43,7 +43,7 @@ def combined(
     """lambda_l1 L1 + lambda_ssim (1 - SSIM) + lambda_gradient `gradient_error` of an image and its truth, both Float
     [height * width], row by row.
 
-    L1 is the mean absolute error, its subgradient 0 where the two agree. SSIM is that of Wang et al. (IEEE TIP 2004) in the form
+    L1 is the mean absolute error, its subgradient 0 where the two agree. SSIM is by Wang et al. (IEEE TIP 2004) in the form
     of 3D Gaussian Splatting: a Gaussian window of 11 x 11 pixels, sigma 1.5, zeros around the images, full scale 1,
     C1 = 0.01^2, C2 = 0.03^2, biased variances. Differentiable in the image, in reverse mode; the truth is a constant. Raises
     InputError if an image has another number of pixels.
@@ -61,7 +61,7 @@ def combined(
 def gradient_error(image: Any, truth: Any, height: int, width: int) -> Any:
     """Root mean square of the gradient of image - truth, both Float [height * width], row by row.
 
-    The gradient is that of differences of neighbouring pixels along rows and columns; there are none across the edge.
+    The gradient consists of differences of neighbouring pixels along rows and columns; there are none across the edge.
     Backprojection blurs: of a structure of spatial frequency w, one step down the squared difference restores a share that falls
     as 1 / w. FDK filters projections with w before; here the difference is squared with the weight w^2, so that fine structures
     are restored as fast as coarse ones. Differentiable in the image, in reverse mode; the truth is a constant.
@@ -252,7 +252,7 @@ class _Tiles:
 
     @staticmethod
     def _step(origins, k):
-        """The origin of tap k's tile relative to that of the tile itself."""
+        """The origin of tap k's tile relative to the origin of the tile itself."""
         if 0 <= k < TILE:
             return mi.Float(0), mi.Float(0)
         there, here = origins[k // TILE + 1], origins[1]

@@ -160,9 +160,9 @@ class Stepper(ABC):
     method : Method
         As used, with lengths in the normalised frame.
     geometry : Geometry
-        Of the scan.
+        Geometry of the scan.
     model : Model
-        Of the fit.
+        Model of the fit.
     """
 
     method: Method

@@ -52,7 +52,7 @@ def require_same_fit(stored: Checkpoint, method: Method, scan: Scan, seed: int, 
     method : Method
         With the limits that the scan sets.
     path : Path
-        Of the checkpoint, for the message.
+        Path of the checkpoint, for the message.
     """
     before, now = stored.method.flat(), method.flat()
     free = {'checkpoint_seconds'}

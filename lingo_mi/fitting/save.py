@@ -62,7 +62,7 @@ def write_fit(
     report : callable
         The contents of the report with all numbers. A report that cannot be drawn is a warning.
     unit : Unit
-        Of the values in the volume's file.
+        Unit of the values in the volume's file.
 
     Raises
     ------

@@ -35,13 +35,13 @@ class GaussianStepper(Stepper):
     method : CloudMethod
         As used, with lengths in the normalised frame.
     model : CloudModel
-        Of the fit.
+        Model of the fit.
     targets : list of MeasuredView
         The measured views on the device.
     corrections : sequence of Correction
         What is fitted besides the cloud.
     share : Float or None
-        Of the second of two materials in every Gaussian.
+        Share of the second of two materials in every Gaussian.
     """
 
     method: CloudMethod

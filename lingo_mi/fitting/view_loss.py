@@ -77,7 +77,7 @@ class MeasuredView:
 
 
 def targets_of(scan: Scan, unit: float, weights: str = 'equal') -> list[MeasuredView]:
-    """All views of a scan. unit: of density; weights: as of `ImageLoss`."""
+    """All views of a scan. unit: of density; weights: as for `ImageLoss`."""
     factors = weights_of(scan, weights)
     return [MeasuredView.of(scan, i, unit, factors) for i in range(len(scan))]
 

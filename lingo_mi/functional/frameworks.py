@@ -51,9 +51,9 @@ def call(function: Callable[..., Any], arguments: Sequence[Argument], shape: tup
     arguments : Sequence[Argument]
         Arrays of one kind.
     shape : tuple[int, ...]
-        Of the result.
+        Shape of the result.
     name : str
-        Of the caller, for messages.
+        Name of the caller, for messages.
 
     Raises
     ------

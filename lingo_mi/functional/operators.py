@@ -197,7 +197,7 @@ def voxelize(
 
 
 def _taken(means, scales, quaternions, density, where, extent) -> tuple[tuple, Any, float]:
-    """Four arrays, where they are projected or sampled, and the cut-off, of a call with arrays or with `Gaussians`."""
+    """The four arrays of a call with arrays or with `Gaussians`, the geometry or grid, and the cut-off."""
     if not isinstance(means, Gaussians):
         return (means, scales, quaternions, density), where, checked_extent(cutoff.RENDER if extent is None else extent)
     if quaternions is not None or density is not None or (scales is not None and where is not None):

@@ -25,7 +25,7 @@ def rays_argument(rays: Any, views: int) -> Argument:
 def on_host(vectors: Any, geometry: Geometry) -> Rays:
     """The rays of a tensor [n, 4, 3]. Raises InputError, naming the first bad view: see `Rays.checked`. Waits for the device.
 
-    Also for curved panels, whose rays are no such vectors.
+    Also for curved panels, whose rays are not such vectors.
     """
     if isinstance(geometry, CurvedGeometry):
         raise InputError(

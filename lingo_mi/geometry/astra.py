@@ -11,7 +11,7 @@ nothing about where a row lies: vectors made by ASTRA's own `geom_2vec` have v a
 both mean the same as long as they stay with their projections. `circle` and `views` reverse ASTRA's rows, so that its scanners
 are this package's.
 
-A geometry of two dimensions, `fanflat`, `parallel`, or their vectors (source or ray, centre, u), is that of a panel of one row
+A geometry of two dimensions, `fanflat`, `parallel`, or their vectors (source or ray, centre, u), has a panel of one row
 before a volume of one slice at z = 0: `sinogram[:, None]` goes with it. ASTRA's image is then `volume[:, ::-1, 0].T`, its first
 row at the largest y. `to_vectors(rays, (1, columns))[:, [0, 1, 3, 4, 6, 7]]` are the vectors of two dimensions.
 
@@ -62,7 +62,7 @@ def scan(proj_geom: dict, vol_geom: dict | None = None, **voxels: Unpack[Voxels]
     vol_geom : dict
         Of `astra.create_vol_geom`. In two dimensions, its slice is as thick as a pixel is wide.
     **voxels
-        Instead of vol_geom: either grid, or nVoxel, dVoxel and offOrigin, as of `Geometry.cone`.
+        Instead of vol_geom: either grid, or nVoxel, dVoxel and offOrigin, as for `Geometry.cone`.
 
     Raises
     ------
@@ -92,7 +92,7 @@ def to_vectors(rays: Rays, nDetector: tuple[int, int]) -> np.ndarray:
 
 
 def from_vectors(vectors: ArrayLike, nDetector: tuple[int, int], parallel: bool) -> Rays:
-    """The views of ASTRA's vectors [n, 12]; nDetector is (v, u) pixels. InputError where they are no poses."""
+    """The views of ASTRA's vectors [n, 12]; nDetector is (v, u) pixels. InputError if they are not poses."""
     vectors = limits.lengths('poses', vectors)
     if vectors.ndim != 2 or vectors.shape[1] != 12 or not len(vectors):
         raise InputError(
@@ -131,7 +131,7 @@ def _bent_towards_source(rays):
 
 
 def in_space(proj_geom: dict) -> dict:
-    """A dict of three dimensions: of a panel of one row, as high as a pixel is wide, where it has two.
+    """A dict of three dimensions: of a panel of one row, as high as a pixel is wide, if it has two.
 
     Raises
     ------
@@ -236,7 +236,7 @@ def kind_of(proj_geom: dict) -> str:
     Raises
     ------
     InputError
-        If this is no dict, or no text.
+        If this is not a dict or a text.
     """
     kind = proj_geom.get('type', '') if isinstance(proj_geom, Mapping) else None
     if not isinstance(kind, str):

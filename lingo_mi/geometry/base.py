@@ -374,7 +374,7 @@ class Geometry(ABC):
         return nv * dv, nu * du
 
     def normalised_rays(self, curved: bool = False) -> Rays:
-        """The rays of all views in the normalised frame of the grid. curved: as of `rays`."""
+        """The rays of all views in the normalised frame of the grid. curved: as for `rays`."""
         rays, centre, k = self.rays(curved), np.array(self.grid.centre), self.grid.scale
         source = rays.source if rays.parallel else (rays.source - centre) * k
         return replace(rays, source=source, corner=(rays.corner - centre) * k, u=rays.u * k, v=rays.v * k)

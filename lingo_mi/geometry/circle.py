@@ -108,7 +108,7 @@ def require_mode(mode: Any) -> None:
 
 
 def circle_of(rays: Rays, nDetector: tuple[int, int]) -> dict[str, Any] | None:
-    """DSO, DSD, dDetector, offDetector and angles of the circle that the poses are, None where they are none."""
+    """DSO, DSD, dDetector, offDetector and angles of the circle that the poses are, None if they are not on one."""
     out = -rays.source if rays.parallel else rays.source
     angles = np.arctan2(out[:, 1], out[:, 0])
     c, s = np.cos(angles), np.sin(angles)

@@ -64,7 +64,7 @@ class Curve:
         return 1 - radius / distance * (1 - np.cos((np.asarray(x, float) - self.middle) / radius))
 
     def columns(self, x: ArrayLike, view: int | slice = slice(None)) -> np.ndarray:
-        """X of column positions x, as of `share`."""
+        """X of column positions x, as for `share`."""
         x = np.asarray(x, float)
         radius, foot = _column(self.radius[view]), _column(self.foot_u[view])
         return foot + (self.middle + radius * np.sin((x - self.middle) / radius) - foot) / self.share(x, view)

@@ -17,7 +17,7 @@ def drawing(rays: Rays, nDetector: tuple[int, int], grid: Grid) -> str:
     Parameters
     ----------
     rays : Rays
-        Of all views; nDetector: the panel's pixels, (v, u).
+        Rays of all views; nDetector: the panel's pixels, (v, u).
     grid : Grid
         The volume.
     """

@@ -124,7 +124,7 @@ class Grid:
 
 
 class Voxels(TypedDict, total=False):
-    """The grid of a scan: either itself, or by TIGRE's numbers, (x, y, z), of which offOrigin is 0 unless it is there."""
+    """The grid of a scan: either itself, or by TIGRE's numbers, (x, y, z). offOrigin is 0 if it is missing."""
 
     grid: Grid
     nVoxel: ArrayLike

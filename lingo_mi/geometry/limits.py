@@ -71,7 +71,7 @@ def vector(name: str, value: ArrayLike, length: int) -> tuple:
     Raises
     ------
     InputError
-        For anything else.
+        If it is anything else.
     """
     array = np.atleast_1d(numbers(name, value)).ravel()
     if len(array) == 1:
@@ -105,7 +105,7 @@ def counts(name: str, value: ArrayLike, length: int) -> tuple:
 
 
 def require_proportions(long: Iterable[float], short: Iterable[float]) -> None:
-    """Raises InputError where the longest length of a scan is too many times the shortest. Zeros do not count."""
+    """Raises InputError if the longest length of a scan is too many times the shortest. Zeros do not count."""
     longest, shortest = (max(map(abs, long)), min(map(abs, short)))
     if not (LEAST_LENGTH <= shortest and longest <= MOST_LENGTH and longest <= MOST_LENGTH * shortest):
         raise InputError(

@@ -50,7 +50,7 @@ def from_matrices(
     if not np.all(np.abs(matrices) < MOST):
         raise InputError(f'a projection matrix holds NaN or infinity, or numbers beyond {MOST:.0e}')
     P = np.linalg.inv(_TO_INDEX) @ matrices
-    with np.errstate(all='ignore'):  # of what is no pose, which `checked` refuses
+    with np.errstate(all='ignore'):  # of what is not a pose, which `checked` refuses
         rows = list(_parallel(P, towards) if parallel else _cone(P, towards, dDetector[1]))
     return Rays(*(np.array(column) for column in zip(*rows)), parallel=parallel).checked()
 
@@ -59,10 +59,10 @@ def _cone(P, towards, step):
     for view, p in enumerate(P):
         m = p[:, :3]
         if not np.linalg.cond(m / np.linalg.norm(m, axis=1, keepdims=True).clip(1e-300)) < 1e12:
-            raise InputError(f'the projection matrix of view {view} is that of no cone beam')
+            raise InputError(f'the projection matrix of view {view} does not belong to a cone beam')
         inverse = np.linalg.inv(m)
         source = -inverse @ p[:, 3]
-        # w = m[2] (x - source) grows away from the source: that of a point in front is positive.
+        # w = m[2] (x - source) grows away from the source: it is positive for a point in front.
         sign = np.sign(m[2] @ (towards - source))
         if sign == 0:
             raise InputError(f'the projection matrix of view {view} puts the volume level with its source')
@@ -76,7 +76,7 @@ def _parallel(P, towards):
     for view, p in enumerate(P):
         if np.abs(p[2, :3]).max() > 1e-9 * np.abs(p[:2, :3]).max() or p[2, 3] == 0:
             raise InputError(
-                f'the projection matrix of view {view} is that of no parallel beam: its last row must be 0, 0, 0, 1'
+                f'the projection matrix of view {view} does not belong to a parallel beam: its last row must be 0, 0, 0, 1'
             )
         p = p / p[2, 3]
         a, b = p[:2, :3]

@@ -144,7 +144,7 @@ class Rays:
         Raises
         ------
         InputError
-            Naming the first bad view, where an array is not [n, 3] or not finite, where u and v span no panel, or where the rays
+            Naming the first bad view, if an array is not [n, 3] or not finite, if u and v span no panel, or if the rays
             run along it.
         """
         source, corner, u, v = (numbers(name, a) for name, a in zip(('source', 'corner', 'u', 'v'), self._arrays()))

@@ -76,7 +76,7 @@ def scan(
     nDetector, dDetector
         Pixels and pixel size in mm, (v, u).
     **voxels
-        Either grid, or nVoxel, dVoxel and offOrigin, as of `Geometry.cone`.
+        Either grid, or nVoxel, dVoxel and offOrigin, as for `Geometry.cone`.
 
     Raises
     ------
@@ -227,14 +227,14 @@ def _views(path):
         for event in parser.read_events():
             depth += 1 if event[0] == 'start' else -1
             if depth > 3:
-                raise InputError(f'{path}: is no {ROOT}: it is nested more than 3 deep')
+                raise InputError(f'{path}: is not {ROOT}: it is nested more than 3 deep')
         root = ElementTree.fromstring(text)
     except InputError:
         raise
     except (ElementTree.ParseError, UnicodeDecodeError, ValueError, RecursionError) as error:
-        raise InputError(f'{path}: is no XML ({one_line(error)})') from None
+        raise InputError(f'{path}: is not XML ({one_line(error)})') from None
     if root.tag != ROOT or root.get('version') not in ('2', '3'):
-        raise InputError(f'{path}: is no {ROOT} of version 2 or 3')
+        raise InputError(f'{path}: is not {ROOT} of version 2 or 3')
     shared = dict.fromkeys((*_NUMBERS, RADIUS), 0.0)
     for node in root:
         if node.tag != 'Projection':

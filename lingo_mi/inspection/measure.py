@@ -31,9 +31,9 @@ WIDE = 2  # half a panel over its distance from the source, which no panel has
 BLOCK = (
     5,
     3,
-)  # pixels along the edge of the panel and across, of which the median is taken: a noisy pixel is not the object
+)  # pixels along the edge of the panel and across: their median is taken, since a noisy pixel is not the object
 SURE = 6  # standard deviations above air that are the object
-UNEQUAL = 0.03  # relative deviation of the masses of parallel views that is no discretisation
+UNEQUAL = 0.03  # relative deviation of the masses of parallel views that discretisation does not explain
 
 
 # Why the consistency of the views is not measured: the scanner leaves the circle, the panel does not see the plane of the source
@@ -68,7 +68,7 @@ class Orbit:
     Attributes
     ----------
     turn : float or None
-        Radians from the first view to one after the last; 0 if all views have the same angle, None if they are no circle.
+        Radians from the first view to one after the last; 0 if all views have the same angle, None if they are not on a circle.
     unit : {'radians', 'degrees'} or None
         The unit that the angles seem to have instead of the right one.
     obstacle : Obstacle or None
@@ -274,7 +274,7 @@ def _without(scan, columns):
 
 
 def intensity_warning(I0: float) -> str:
-    """What to do with projections that are intensities, `I0` beside the object."""
+    """The message about projections that are intensities, `I0` beside the object."""
     return (
         'these look like intensities, not line integrals: values are highest, and alike, at the edges of the panel; write '
         f'input: intensity and I0: {I0:.4g} into the geometry file (.yml), import the frames with lingo-mi import, or give '
@@ -289,8 +289,10 @@ def warn_of_intensities(scan: Scan) -> None:
 
 
 def open_beam(scan: Scan) -> float | None:
-    """The intensity beside the object, if projections look like intensities: highest, and alike, at the left and right edge of
-    the panel. None if they do not. Of many views, 64 are looked at."""
+    """The intensity beside the object, or None if projections do not look like intensities.
+
+    Intensities are highest, and alike, at the left and right edge of the panel. At most 64 views are examined.
+    """
     if len(scan) > MOST_VIEWS:
         scan = scan.subset(np.arange(MOST_VIEWS) * len(scan) // MOST_VIEWS)
     p, edge = scan.projections, max(1, scan.geometry.nDetector[1] // 64)
@@ -418,7 +420,7 @@ def _plane(scan: Scan, air: float) -> Plane | Obstacle:
 
 
 def _bridged(values, valid):
-    """A row with what is not known interpolated between its neighbours."""
+    """A row whose invalid pixels are interpolated between their neighbours."""
     place = np.arange(len(values))
     return values if valid.all() or not valid.any() else np.interp(place, place[valid], values[valid])
 

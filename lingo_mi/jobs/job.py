@@ -17,7 +17,7 @@ class Job:
     Parameters
     ----------
     name : str
-        Of the job, another one for each.
+        Name of the job, another one for each.
     steps : int
         That it reports, for the progress.
     function : callable
@@ -39,9 +39,9 @@ class Event(NamedTuple):
     Parameters
     ----------
     name : str
-        Of the job.
+        Name of the job.
     kind : str
-        'began'; 'resumed', where its first step is not the first of all; 'step'; and at the end 'done', 'failed', or 'stopped':
+        'began'; 'resumed', if its first step is not the first of all; 'step'; and at the end 'done', 'failed', or 'stopped':
         interrupted, and to be gone on with.
     value
         Began: where (text); resumed, step: the steps done; done: what the function returned; failed: one line.
@@ -69,7 +69,7 @@ def attempt(job: Job, report: Callable[..., None], tell: Tell) -> Event:
     report : callable
         Called between steps, as the job's own.
     tell : Tell
-        Called with 'resumed', where the job goes on from what is stored.
+        Called with 'resumed', if the job goes on from what is stored.
     """
     first = True
 

@@ -24,7 +24,7 @@ def describe_worker(folder: str, dask_worker: Any) -> dict:
 
 
 def require_fit(worker: dict, folder: str) -> None:
-    """Raises InputError where a worker, by what `describe_worker` says, cannot do the jobs."""
+    """Raises InputError if a worker, by what `describe_worker` says, cannot do the jobs."""
     who = f'worker {worker["address"]}'
     if worker['version'] != (ours := version('lingo_mi')):
         raise InputError(f'{who}: has lingo_mi {worker["version"]}, not {ours}; install the same there')
@@ -44,9 +44,9 @@ def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str
     Parameters
     ----------
     key : str
-        Of the task.
+        Key of the task.
     topic : str
-        Of the events that it sends.
+        Topic of the events that it sends.
     folder : str
         That all workers share.
     threads : int

@@ -121,7 +121,7 @@ def valid_voxels(
     rays : Rays
         n views in the normalised frame.
     masks : Masks
-        Of the same n views.
+        Masks of the same n views.
     grid : Sequence[int] or ndarray
         Cells (x, y, z) over [-half, half].
     misses : int
@@ -148,7 +148,7 @@ def valid_voxels(
     if total <= CHUNK:
         cells = np.arange(total)
     else:
-        # With negative thresholds, or low_factor above 1, high is no part of low. Invalid pixels exclude no cell.
+        # With negative thresholds, or low_factor above 1, high is not a part of low. Invalid pixels exclude no cell.
         possible = masks.low | masks.high
         if masks.valid is not None:
             possible |= ~masks.valid

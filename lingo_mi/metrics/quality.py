@@ -10,7 +10,7 @@ Each measure comes in two forms. The plain name is the absolute one, and `_r2` i
 
 Published tables hold R2-Gaussian's forms.
 
-Every function takes the result first and the truth second, raises InputError where the shapes differ or a
+Every function takes the result first and the truth second, raises InputError if the shapes differ or a
 value is not finite, and returns a float: inf dB for identical images, NaN where the truth holds nothing to
 compare with.
 
@@ -158,7 +158,7 @@ def ssim_3d(volume: ArrayLike, truth: ArrayLike, peak: float | None = None) -> f
 
 
 def compared(volume: ArrayLike, truth: ArrayLike) -> dict[str, float | None]:
-    """PSNR and SSIM of a volume [x, y, z], each in both forms, by name; None where the value is not finite.
+    """PSNR and SSIM of a volume [x, y, z], each in both forms, by name; None if the value is not finite.
 
     compared(found.volume, truth)['psnr_3d']
     """

@@ -337,7 +337,7 @@ class Branching:
     inside : callable or None
         Predicate of a point [3]: a branch that would leave it ends there; None: anywhere.
     shrink : float
-        Radius of a branch's end over that of its start.
+        Radius of a branch's end over the radius of its start.
     """
 
     inside: Callable[[np.ndarray], bool] | None = None

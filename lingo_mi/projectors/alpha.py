@@ -7,7 +7,7 @@ With c the radiance of a Gaussian, o its opacity and q its squared distance in s
     alpha = min(0.99, o exp(-q / 2)), left out below 1/255
     C     = sum over Gaussians by depth  c alpha T,    T = product of (1 - alpha) of those in front
 
-which stops before T falls below 1e-4. Depth is that of the centre along the panel's normal. This is not an X-ray projection;
+which stops before T falls below 1e-4. Depth is measured at the centre, along the panel's normal. This is not an X-ray projection;
 it is the image formation of the baselines.
 
 The image is cut into tiles of 8 x 8 pixels. Gaussians are sorted by depth, each is listed in the tiles that it touches, and

@@ -174,7 +174,7 @@ class Share:
     blocks : UInt32 [N]
         Blocks of each item.
     layout : Layout
-        Of the teams.
+        Layout of the teams.
     block : int
         Rows of a block.
     """

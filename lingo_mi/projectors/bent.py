@@ -63,9 +63,9 @@ def numbers_of(table: Any, view: Any) -> list[Any]:
 
 
 def column_of(numbers: list[Any], x: Any) -> Any:
-    """The column position on the curved panel of a position X on the flat one: that of `Curve.on_panel`.
+    """The column position on the curved panel of a position X on the flat one, as `Curve.on_panel` gives it.
 
-    Where the ray passes the cylinder, the end of its half circle.
+    If the ray misses the cylinder, the end of its half circle.
     """
     radius, middle, foot, _, distance = numbers
     inv = 1 / distance

@@ -20,7 +20,7 @@ Both are divided by (k|w|)^2, and the first is sheared to a sum of two squares, 
 
 The sum of squares keeps a needle's footprint accurate in float32. For a parallel beam den = 1. The eleven numbers of a
 Gaussian (amplitude, mx, my, shear, e1 ... e22, and the centre) are computed in float64: differences of world coordinates
-lose digits, and the cost is negligible beside that of the pixels. Shear and centre are also stored in float64, because for a
+lose digits, and the cost is negligible beside the cost of the pixels. Shear and centre are also stored in float64, because for a
 needle across the image t cancels down to the needle's width. The others are stored in float32.
 
 The footprint at the cut-off of kappa standard deviations is the conic |w x d| <= kappa |d|. It is an ellipse if the

@@ -198,7 +198,7 @@ class Instance:
     """An object of a `shapegroup`, moved by an affine transform, the `to_world` of an `instance`.
 
     The rays are moved back instead: a ray o + t D of the world is M^-1 o + t M^-1 D in the object's frame, so the line
-    integral is that of the object, times |D| / |M^-1 D|. Derivatives reach the object and the transform.
+    integral is the integral of the object, times |D| / |M^-1 D|. Derivatives reach the object and the transform.
     """
 
     def __init__(self, shape: mi.Shape, content: Any):

@@ -13,7 +13,7 @@ pixel. The kernels therefore store where the ridge t = 0 crosses the row of the 
 x). They follow it from row to row with twice float32's digits. Within a row, t is a whole number of pixels from the pixel
 on the ridge, less a fraction.
 
-On a curved panel the lanes work on columns instead, and `_InColumn` does what differs: the columns are no whole pixels apart on
+On a curved panel the lanes work on columns instead, and `_InColumn` does what differs: the columns are not whole pixels apart on
 the flat panel that footprints refer to, and its pixels s times as long. t is then counted in the curved panel's own pixels, and
 where the ridge is in float64.
 """
@@ -116,7 +116,7 @@ class _Packed:
     packets : Int32
         Packets per image row.
     bend : Bend or None
-        Of a curved panel.
+        Bend of a curved panel.
     """
 
     numbers: Any
@@ -171,7 +171,7 @@ class Plan:
         return sums.columns()
 
     def _upright(self, image):
-        """The image row by row: that of a curved panel is made column by column."""
+        """The image row by row: the splat makes the image of a curved panel column by column."""
         return image if self.packed.bend is None else turned(image, self.height, self.width)
 
 
@@ -200,7 +200,7 @@ class _Item:
         return self if self.bend is None else _InColumn(self, y, self.bend)
 
     def rows_from_centre(self, y):
-        """The distance of row y from that of the centre, in rows."""
+        """The distance of row y from the row of the centre, in rows."""
         return mi.Float(y - self.row)
 
     def on_ridge(self, n):

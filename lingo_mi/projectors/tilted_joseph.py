@@ -1,6 +1,6 @@
 """Joseph's projector and its exact transpose for any panel: turned, tilted, laminography (Dr.Jit, llvm or cuda).
 
-The model is that of `joseph`, but the main axis of a ray may also be z. Nothing is scattered here either: a voxel gathers from
+The model is as in `joseph`, but the main axis of a ray may also be z. Nothing is scattered here either: a voxel gathers from
 the pixels within the shadow of its neighbours, a rectangle on a flat panel, and computes the weight of each. Before an upright
 panel, `joseph` is faster, since a voxel's weights in a column have much in common.
 """
@@ -181,7 +181,7 @@ def _integrate(data, size, ray: Ray):
 
 
 def _shadow(r, point) -> Any:
-    """Where rays that pass within a voxel of `point` in its slice meet the (flat) panel, along u and v: shadows as of `_pixels`.
+    """Where rays that pass within a voxel of `point` in its slice meet the (flat) panel, along u and v: shadows as for `_pixels`.
 
     A shift by s moves the shadow along u by (p - u w) s / (w0 + w s), with p and w rows of the projection matrix r and w0 the
     point's value of w. One entry of s, that along the main axis, is zero.
@@ -204,14 +204,14 @@ def _pixels(spot, count):
 
 
 def _on_arc(spot, numbers):
-    """A shadow along u, as of `_pixels`, on the curved panel. numbers: see `bent.numbers_of`."""
+    """A shadow along u, as for `_pixels`, on the curved panel. numbers: see `bent.numbers_of`."""
     middle, reach = spot
     low, high = (bent.column_of(numbers, middle + s * (reach + 0.5)) for s in (-1, 1))
     return 0.5 * (low + high), 0.5 * (high - low) + (SLACK - 0.5)
 
 
 def _at_column(spot, numbers, scale):
-    """A shadow along v, as of `_pixels`, in a column of the curved panel whose s is `scale`."""
+    """A shadow along v, as for `_pixels`, in a column of the curved panel whose s is `scale`."""
     middle, reach = spot
     foot, inv = numbers[3], dr.rcp(scale)
     return dr.fma(middle - foot, inv, foot), (reach + 0.5) * inv + (SLACK - 0.5)

@@ -40,7 +40,7 @@ class View:
     parallel : bool
         Whether the beam is parallel.
     bend : Bend or None
-        Of a curved panel. It is constant: a pose is differentiable as a rigid motion of source and panel together.
+        Bend of a curved panel. It is constant: a pose is differentiable as a rigid motion of source and panel together.
     """
 
     source: Any

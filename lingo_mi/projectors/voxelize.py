@@ -1,6 +1,6 @@
 """A cloud of Gaussians sampled at the voxel centres of a grid, and its gradient.
 
-sigma(x) = sum_i rho_i exp(-1/2 |diag(1/s_i) R_i^T (x - p_i)|^2). The method is that of the splat with one more dimension: a
+sigma(x) = sum_i rho_i exp(-1/2 |diag(1/s_i) R_i^T (x - p_i)|^2). The method is the splat with one more dimension: a
 lane works on one line of voxels along x. The whitened distance is a sum of three squares (a Cholesky factor), so that
 needles lose no digits:
 

@@ -22,7 +22,7 @@ class Beam:
     panel : Fields
         Of the whole frame.
     i0 : float or None
-        Counts of the beam, where they are given, as an option or as Nikon's white level.
+        Counts of the beam, if they are given, as an option or as Nikon's white level.
     air : tuple[int, int, int, int] or None
         (v0, v1, u0, u1): pixels whose mean is the air level of a view.
     percentile : float or None

@@ -64,7 +64,7 @@ class _View:
 
 
 def is_projection(header: Any) -> bool:
-    """Whether a DICOM header is that of such a file."""
+    """Whether such a file has this DICOM header."""
     return any(tag in header for _, tag in ATTRIBUTES.values())
 
 

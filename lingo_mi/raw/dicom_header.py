@@ -11,7 +11,7 @@ from lingo_mi.common.errors import InputError, shown
 
 
 def floats(value: Any) -> np.ndarray | None:
-    """Numbers of a header, float64 [m]; None where they are missing or empty.
+    """Numbers of a header, float64 [m]; None if they are missing or empty.
 
     Raises
     ------

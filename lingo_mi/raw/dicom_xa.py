@@ -146,7 +146,7 @@ def _lacking(run):
 
 
 def _angles(header, n):
-    """The angles of n frames by name, None where they are missing; `first`: the primary one of the first frame."""
+    """The angles of n frames by name, None if they are missing; `first`: the primary one of the first frame."""
     out = {'first': floats(_attribute(header, 0, _PRIMARY))}
     for name in _PRIMARY, _SECONDARY:
         start, steps = floats(header.get(name)), floats(header.get(name + 'Increment'))
@@ -163,7 +163,7 @@ def _angles(header, n):
 
 
 def _attribute(header, k, name):
-    """An attribute of frame k: its own, one that all frames share, or the file's; None where it has none."""
+    """An attribute of frame k: its own, one that all frames share, or the file's; None if it has none."""
     frames, shared = (header.get(f'{of}FunctionalGroupsSequence') for of in ('PerFrame', 'Shared'))
     groups = [*(frames or [])[k : k + 1], *(shared or [])[:1]]
     return _first(value for value in [*(_within(group, name) for group in groups), header.get(name)])

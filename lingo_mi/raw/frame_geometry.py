@@ -1,4 +1,4 @@
-"""Where frames were taken: a geometry file, or a `Geometry`, checked against the frames, and that of a part of the panel."""
+"""The geometry of frames, from a file or a `Geometry`, checked against the frames, and of a part of the panel."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ GEOMETRY_FILES = ', '.join(('.yml', *SCANNER_FILES, '.xml (RTK)'))
 
 
 def has_grid(geometry: PathLike | str | Geometry | None) -> bool:
-    """Whether it says how many voxels there are; else they are those of `grid_in_view`."""
+    """Whether a geometry gives the number of voxels. If not, `grid_in_view` makes the grid."""
     if isinstance(geometry, Geometry):
         return True
     if geometry is None or Path(geometry).suffix.lower() not in ('.yml', '.yaml'):

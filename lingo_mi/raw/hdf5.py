@@ -68,7 +68,7 @@ def open_hdf5(path: Path) -> Recording:
 
 
 def _require_links(path, file):
-    """Raises InputError where data are in another file that is not there: HDF5 says no more than that it cannot open it."""
+    """Raises InputError if data are in another file that is not there: HDF5 says no more than that it cannot open it."""
     h5py = optional('h5py')
 
     def follow(group, depth):

@@ -18,7 +18,7 @@ from lingo_mi.raw.recording import Frames
 
 DEAD = 0.5  # a pixel whose gain is this part from its neighbours' is bad
 DIFFERENCE = (1, -4, 6, -4, 1)
-MOST_VIEWS = 64  # of which noise is measured
+MOST_VIEWS = 64  # whose noise is measured
 FULL = 0.9  # a flat with more of its pixels saturated is none
 UNLIKE = 0.5  # a flat below this part of the others' brightness, or above its inverse, is none
 OUTLIER, BRIGHTER = 8.0, 1.1  # standard deviations and times by which an outlier is brighter than its neighbours
@@ -61,7 +61,7 @@ def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None, s
     Raises
     ------
     InputError
-        If a panel has another size than `shape`, the flats are no brighter than dark or saturated, or one is unlike the others.
+        If a panel has another size than `shape`, the flats are dark or saturated, or one is unlike the others.
     """
     for name, frames in (('flats', flats), ('darks', darks)):
         if frames is not None and frames.shape != shape:
@@ -136,7 +136,7 @@ def counts_to_line_integrals(
     bins : tuple[int, int]
         (v, u) pixels that become one: their counts are added, bad ones left out, before the logarithm.
     exposure : float
-        Of this view over that of the flats; without flats its air level in counts.
+        Of this view over the exposure of the flats; without flats its air level in counts.
     saturation : float
         Counts from here on are not valid.
     outliers : bool

@@ -28,7 +28,7 @@ class Options:
     i0 : float or None
         Instead: counts of the unattenuated beam.
     exposure
-        [n] or one number: exposure of every view over that of the flats.
+        [n] or one number: exposure of every view over the exposure of the flats.
     saturation : float or None
         Counts from here on are not valid; None: the largest value of the integer type of views and of flats.
     crop : tuple[int, int, int, int] or None
@@ -38,7 +38,7 @@ class Options:
     views : tuple[int, int or None, int] or None
         (first, end, step) of the views to keep; the end may be None.
     angles
-        [n] degrees or the file that lists them, where the geometry does not.
+        [n] degrees or the file that lists them, if the geometry does not.
     pixel : float or None
         Size of a raw pixel, mm; for a geometry of RTK.
     rings : bool

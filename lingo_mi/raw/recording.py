@@ -28,7 +28,7 @@ class Frames:
     shape : tuple[int, int]
         Pixels (v, u).
     dtype : np.dtype
-        Of the counts as they are stored.
+        Type of the counts as they are stored.
     read : callable
         read(i) -> [v, u], frame i, as it is stored.
     """
@@ -95,13 +95,13 @@ class Recording:
     Parameters
     ----------
     views : Frames
-        Of the object.
+        Views of the object.
     flats, darks : Frames or None
         Without object, and without beam.
     angles : ndarray or None
         [n] degrees.
     taken : callable or None
-        taken() -> Taken, where it says that. Raises InputError where something is missing, which --geometry can say instead.
+        taken() -> Taken, if it says that. Raises InputError if something is missing, which --geometry can say instead.
     transmission : bool
         Whether the views are shares of the unattenuated beam, which the scanner's software has corrected, and not counts.
     """

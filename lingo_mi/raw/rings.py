@@ -3,7 +3,7 @@
 A gain of 1 + g adds -ln(1 + g) to a pixel's line integrals in every view, and a reconstruction turns that into a ring or an arc.
 The object's own details move from view to view. So the offset of a pixel is the median over the views of its difference to a
 smooth curve along its row (after Boin and Haibel, Opt. Express 14, 2006, who compare the mean over the views with a smooth curve:
-edges that stand still for some views shift a mean, and hardly a median). The curve is that of Savitzky and Golay (Anal. Chem. 36,
+edges that stand still for some views shift a mean, and hardly a median). It is the curve of Savitzky and Golay (Anal. Chem. 36,
 1964), of degree 4, because a flatter one takes the curvature of the object for an offset.
 """
 

@@ -40,7 +40,7 @@ class Reconstruction:
     seconds : float
         Wall-clock time.
     grid : Grid
-        Of the volume.
+        Grid of the volume.
 
     Examples
     --------
@@ -67,7 +67,7 @@ class Reconstruction:
 
     def metrics(self, truth: ArrayLike) -> dict[str, float | None]:
         """PSNR in dB and SSIM of the volume: psnr_3d and ssim_3d, whose full scale is the largest true density, and psnr_3d_r2
-        and ssim_3d_r2, R2-Gaussian's, whose full scale is 1; None where a value is not finite.
+        and ssim_3d_r2, R2-Gaussian's, whose full scale is 1; None if a value is not finite.
 
         Parameters
         ----------
@@ -91,7 +91,7 @@ class Reconstruction:
         path : path-like
             .nii, .nii.gz, a new .ome.zarr, or a new folder .dicom for a DICOM series (in 'hu'); its folder is made.
         units : str
-            Of the values in the file: '1/mm', '1/cm' or 'hu', Hounsfield units.
+            Unit of the values in the file: '1/mm', '1/cm' or 'hu', Hounsfield units.
         mu_water : float or None
             Attenuation of water, 1/mm, for 'hu'.
         force : bool
@@ -140,7 +140,7 @@ class Algorithm(ABC):
         """Reconstruct the volume of a scan, without the checks of `run_algorithm`, which describes the arguments."""
 
     def seeing(self, effects: Effects | None) -> Algorithm:
-        """The algorithm for line integrals of a scan that had these effects, of which it may use what is known of the noise."""
+        """The algorithm for line integrals of a scan that had these effects. It may use what they tell about the noise."""
         return self
 
     @property

@@ -11,7 +11,7 @@ def gaps(angles: np.ndarray, turn: float) -> tuple[np.ndarray, np.ndarray, bool]
     """The order of the views around the circle, the gap after each in that order, and whether the arc is open.
 
     Angles are taken modulo `turn`, radians. An open arc begins with the first view; the views at its ends represent a typical
-    gap. It lacks `MISSING` or more; a circle of which a view or two are left out is closed.
+    gap. It lacks `MISSING` or more; a circle that lacks a view or two is closed.
     """
     angle = np.mod(angles, turn)
     order = np.argsort(angle, kind='stable')

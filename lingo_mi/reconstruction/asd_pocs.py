@@ -120,12 +120,12 @@ class ASDPOCS(Algorithm):
     noneg : bool
         Whether P sets negative densities to zero.
     OrderStrategy : str
-        Of the blocks, see `OSSART`.
+        Order of the blocks, see `OSSART`.
     exact_every : int
         Passes between corrections for the error of Joseph's projector (`System.correct`), from the first pass on; 0: no
         corrections.
     seed : int
-        Of the random order, at least 0.
+        Seed of the random order, at least 0.
 
     Raises
     ------

@@ -35,7 +35,7 @@ from lingo_mi.scan import Scan, values_digest
 from lingo_mi.storage.file_access import as_path, new_file, write_text, writing
 
 START, TRIAL = 10, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
-LONG = 50  # passes of ASD-POCS, at most, where it is given out itself
+LONG = 50  # passes of ASD-POCS, at most, if it is the result itself
 AHEAD = 0.9  # times the score of the scan's own voxels: below it smaller ones are clearly ahead after `TRIAL` passes
 MARGIN = 1.02  # how much better the scan's own voxels must be than smaller ones, see `Best`
 LITTLE = 0.95  # times the score after one pass of a refinement: where more passes bring no more, noise limits them
@@ -222,7 +222,7 @@ class Best(Algorithm):
             If `cloud` is set and `fit` is missing.
         """
         if self.cloud and fit is None:
-            raise InputError('best tries a cloud where it is given a function that fits one: use lm.reconstruct')
+            raise InputError('best needs a function that fits a cloud: use lm.reconstruct')
         began, count = time.perf_counter(), self._counter(progress, self.steps(scan))
         train, held_out = split_views(scan, self.held_out)
         plan = self._plan(train, held_out, count, fit if self.cloud else None)
@@ -262,7 +262,7 @@ class Best(Algorithm):
         return means(volume, finer) if self.voxels == 'means' else values(means(volume, finer))
 
     def _judged(self, plan: list[Trial], train: Scan, held_out: Scan, count) -> Trial:
-        """The trial to apply. ASD-POCS itself gets all its passes first, where it may be given out."""
+        """The trial to apply. ASD-POCS gets all its passes first, if it may be the result."""
         chosen = min(_best(plan[1:]), plan[0], key=lambda trial: trial.score)
         if self.voxels != 'values' and chosen is not plan[0]:
             return chosen

@@ -1,7 +1,7 @@
 """Measured views that are held out of a reconstruction, and how well it predicts them.
 
 Errors of a volume and of its projections are not alike: noise in the voxels, which a reconstruction takes over from noisy views,
-cancels along a ray. By the Fourier slice theorem the squared norm of a slice is that of its parallel projections P, weighted by
+cancels along a ray. By the Fourier slice theorem the squared norm of a slice is the norm of its parallel views P, weighted by
 the frequency w along the detector's rows,
 
     integral of f^2  ~  integral over the angles and w of |w| |P(angle, w)|^2
@@ -66,7 +66,7 @@ class Trial:
     Parameters
     ----------
     name : str
-        Of the setting.
+        Name of the setting.
     finer : int
         Parts along each side of a voxel.
     smooth : bool
@@ -78,9 +78,9 @@ class Trial:
     volume : ndarray or None
         After the pass with the lowest score, on the setting's own voxels.
     output_score : float or None
-        `Score` of the numbers that would be given out, where these decide, else None.
+        `Score` of the numbers that would be given out, if these decide, else None.
     strength : float or None
-        Of a prior, else None.
+        Strength of a prior, else None.
     before : int
         Passes of ASD-POCS that it starts from.
     """
@@ -163,7 +163,7 @@ class TrialWatch:
     Parameters
     ----------
     score : Score
-        Of the held-out views, on the trial's voxels.
+        Score of the held-out views, on the trial's voxels.
     beat : float or None
         Score to come near, to `NEAR`, by the pass `by`, else the trial ends there; None: it goes on.
     slow : bool

@@ -59,7 +59,7 @@ class Refined(Algorithm):
     finer : int
         Parts along each side of a voxel, at least 1; memory grows with its cube.
     seed : int
-        Of the random orders, at least 0.
+        Seed of the random orders, at least 0.
 
     Raises
     ------

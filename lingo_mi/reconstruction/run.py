@@ -89,7 +89,7 @@ def run_in_slabs(
     runner : Runner or None
         Of workers that make the slabs and write them, see `slab_cluster` (None: this process).
     unit : Unit
-        Of the values in the file, for this process.
+        Unit of the values in the file, for this process.
     """
     require_signal(scan)
     path = path.absolute()  # workers have other working directories

@@ -22,7 +22,7 @@ A volume that P does not change, the blur does not change either, so the limit s
 hardly any ray crosses change like their neighbours (`wide_pixels.Between`).
 
 Parameters have the names of TIGRE for Python, if it has them. lmbda, lmbda_red, blocksize and noneg have its defaults;
-OrderStrategy has that of TIGRE for MATLAB.
+OrderStrategy has the default of TIGRE for MATLAB.
 """
 
 from __future__ import annotations
@@ -129,9 +129,9 @@ class Sweeps(Algorithm):
         Parameters
         ----------
         weights : array_like or None
-            Of the voxels [x, y, z], at least 0: relative sizes of their changes (default: equal).
+            Weights of the voxels [x, y, z], at least 0: relative sizes of their changes (default: equal).
         blur : Sequence[float] or None
-            Of the change by a pass: standard deviations in voxels along x, y, z (default: none).
+            Blur of the change by a pass: standard deviations in voxels along x, y, z (default: none).
         """
         began, how = time.perf_counter(), self._by_blocks(len(scan))
         order = passes(scan.geometry.angles, how.blocksize, how.OrderStrategy, how.seed)
@@ -275,7 +275,7 @@ class OSSART(Sweeps):
 class SART(Sweeps):
     """Simultaneous algebraic reconstruction: the volume is updated after every view.
 
-    The rule is that of `OSSART`, with the rows A_b of one view,
+    The rule is the same as in `OSSART`, with the rows A_b of one view,
 
         x  <-  max(x + lmbda (A_b^T W (b - A_b x)) / (A_b^T 1), 0),    W = 1 / (A_b 1)
 
@@ -337,7 +337,7 @@ class SART(Sweeps):
 class SIRT(Sweeps):
     """Simultaneous iterative reconstruction: each update of the volume uses all views.
 
-    The rule is that of `OSSART`, with all rows A,
+    The rule is the same as in `OSSART`, with all rows A,
 
         x  <-  max(x + lmbda (A^T W (b - A x)) / (A^T 1), 0),    W = 1 / (A 1)
 

@@ -48,7 +48,7 @@ _REPLAY = Replay(_replayed)
 
 
 def normalised(error: mi.Float, path: mi.Float) -> mi.Float:
-    """W (b - A x): what images lack over the lengths of their rays (or their weighted lengths); 0 where there is no ray."""
+    """W (b - A x): what images lack over the lengths of their rays (or their weighted lengths); 0 if there is no ray."""
     return evaluated(_over(error, path))
 
 

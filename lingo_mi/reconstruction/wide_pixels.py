@@ -35,8 +35,8 @@ def leave_voxels_out(geometry: Geometry) -> bool:
 def excess_width(geometry: Geometry) -> tuple[float, float, float]:
     """Standard deviations (x, y, z), in voxels, of the `blur` for `sart`: a Gaussian that widens voxels to pixels at the axis.
 
-    Variances add up; that of a box is width^2 / 12. It is doubled, since a pixel's width enters with A and with A^T. Zero if
-    pixels are no wider than voxels.
+    Variances add up; a box has width^2 / 12. It is doubled, since a pixel's width enters with A and with A^T. Zero if
+    pixels are not wider than voxels.
     """
     x, y, z = (sqrt(max(p**2 - 1, 0) / 6) for p in pitch(geometry))
     return x, y, z
@@ -51,7 +51,7 @@ class Between:
     Parameters
     ----------
     geometry : Geometry
-        Of the scan.
+        Geometry of the scan.
     A, views
         Its projector and views.
     """

@@ -56,7 +56,7 @@ def _numbers(data: ReportData) -> str:
     voxels = f'{size} voxels of {" x ".join(f"{s:.4g}" for s in data.spacing)} mm'
     grid = 'The grid that the density is given on.'
     if data.volume is None:
-        grid = 'Opacities and radiances are no attenuation: this cloud makes no volume, and no scene renders it.'
+        grid = 'Opacities and radiances are not attenuation: this cloud makes no volume, and no scene renders it.'
     settings.append(('Volume', voxels, grid))
     others = [
         (key, as_text(key, value), '')

@@ -66,7 +66,7 @@ def payload(data: ReportData, surfaces: bool = True, earlier: Arrays | None = No
 
 
 def _psnr_by_view(views: np.ndarray, truth: np.ndarray, angles: np.ndarray) -> list[float | None]:
-    """PSNR of each view in the order of their angles, dB, None where it is infinite; full scale is the largest value of all."""
+    """PSNR of each view in the order of their angles, dB, None if it is infinite; full scale is the largest value of all."""
     peak, order = float(truth.max()), np.argsort(angles, kind='stable')
     values = [psnr_2d(views[i : i + 1], truth[i : i + 1], peak) if peak > 0 else np.inf for i in order]
     return [value if np.isfinite(value) else None for value in values]
@@ -91,7 +91,7 @@ def slice_payload(
     reference : str or None
         The volume that the others are compared with.
     of : tuple or None
-        The grid's shape, and n, where the volumes are means of n^3 of its voxels already.
+        The grid's shape, and n, if the volumes are means of n^3 of its voxels already.
     quantity : str
         What they hold, with its unit.
     """

@@ -44,7 +44,7 @@ class VolumeFile:
     volume : Volume
         Its density.
     error_map : Volume, optional
-        Of the file V-error.nii.gz beside a volume V.nii.gz, which the algorithm `best` writes.
+        Error map from the file V-error.nii.gz beside a volume V.nii.gz, which the algorithm `best` writes.
     """
 
     volume: Volume
@@ -91,7 +91,7 @@ def compare_page(results: Sequence[tuple[str, Fit | VolumeFile]], truth: Volume 
     truth : Volume, optional
         The true volume, on the same grid.
     title : str
-        Of the page (default: the names).
+        Title of the page (default: the names).
 
     Raises
     ------

@@ -41,9 +41,9 @@ class Live:
     Parameters
     ----------
     geometry : Geometry
-        Of the scan.
+        Geometry of the scan.
     title : str
-        Of the page: any text.
+        Title of the page: any text.
     """
 
     def __init__(self, geometry: Geometry, title: str = ''):

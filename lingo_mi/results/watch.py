@@ -15,7 +15,7 @@ EVERY = 1.0  # seconds between two steps that watchers are told of
 
 
 class Watcher(Protocol):
-    """What looks at a fit."""
+    """The interface of an observer of a fit."""
 
     def search(self, iteration: int, held_out: float) -> None:
         """About every second of a search for the step to stop at (`fitting.stopping`): steps done, and its error so far."""
@@ -24,10 +24,10 @@ class Watcher(Protocol):
         """About every second: `iteration`, `seconds`, `loss`, `gaussians`, and at some also what was measured; steps in all."""
 
     def snapshot(self, fit: Fit) -> None:
-        """At a few moments, each right before the step that has its numbers. The fit knows few of its held-out views."""
+        """Called a few times, right before the step that has its numbers. The fit holds a few of its held-out views."""
 
     def close(self, finished: bool) -> None:
-        """At the end; finished: False where the fit was stopped."""
+        """At the end; finished: False if the fit was stopped."""
 
 
 class Watch:
@@ -49,7 +49,7 @@ class Watch:
         stops_at: int | None = None,
         **_: Any,
     ) -> None:
-        """To be called after every step with what `fitting.loop.run` reports. It returns at once where nothing is to be told."""
+        """Pass on what `fitting.loop.run` reports after every step. It returns at once if nothing is due."""
         now, total = time.perf_counter() - self._began, stops_at or self.total
         if not self.watchers or not (self._new or now - self._reported >= EVERY or iteration == total):
             return
@@ -61,12 +61,12 @@ class Watch:
         self._each(lambda watcher: watcher.step(entry, total))
 
     def snapshot(self, fit: Fit, numbers: dict) -> None:
-        """To be called with a fit that was measured, and what was measured."""
+        """Pass a measured fit, and its numbers, to all watchers."""
         self._new = dict(numbers)
         self._each(lambda watcher: watcher.snapshot(fit))
 
     def close(self, finished: bool) -> None:
-        """To be called at the end."""
+        """Close all watchers."""
         self._each(lambda watcher: watcher.close(finished))
 
     def _each(self, tell: Callable[[Watcher], Any]) -> None:

@@ -18,7 +18,7 @@ def check_memory(*geometries: Geometry | None, views: int = 0, needed: float = 0
     Parameters
     ----------
     views : int
-        Of all geometries together (0: the views that they have).
+        Views of all geometries together (0: the views that they have).
     needed : float
         Peak memory of an algorithm, bytes (0: the least, see `least_memory`).
     """
@@ -40,7 +40,7 @@ def least_memory(geometry: Geometry, views: int) -> int:
 
 
 def thinned(geometry: Geometry, slab: int) -> Geometry:
-    """A scan with the slices of its volume that are in memory at once, of which `slab` are asked for (0: all)."""
+    """A scan with the slices of its volume that are in memory at once, about `slab` of them (0: all)."""
     return geometry.on(geometry.grid.slab(0, min(slab, geometry.grid.shape[2]))) if slab else geometry
 
 
@@ -54,7 +54,7 @@ def require_densities(volume: np.ndarray) -> None:
     if low <= -500 or low < -0.5 * high:
         raise InputError(
             f'the volume holds values from {low:g} to {high:g}, but densities per mm are not negative: convert Hounsfield '
-            'units by numpy.maximum(mu_water * (1 + HU / 1000), 0), where mu_water is that of water, 0.0206 per mm at 60 keV'
+            'units by numpy.maximum(mu_water * (1 + HU / 1000), 0), where mu_water, of water, is 0.0206 per mm at 60 keV'
         )
 
 

@@ -119,7 +119,7 @@ def _counts(props, name):
 
 
 def grid_from(props: Any, grid: Grid) -> Grid:
-    """The voxels that a plugin's properties name, and what they do not name of `grid`."""
+    """The grid of a plugin's properties; `grid` gives what they do not name."""
     values: dict[str, Any] = dict(nVoxel=grid.shape, dVoxel=grid.spacing, offOrigin=grid.centre)
     if 'nVoxel' in props:
         values['nVoxel'] = _counts(props, 'nVoxel')

@@ -24,7 +24,7 @@ _ENCODINGS = 'utf-8', 'us-ascii', 'ascii', 'iso-8859-1', 'latin-1'
 
 
 def scene_files(path: PathLike | str, parameters: dict | None = None) -> list[Path]:
-    """A scene file, those that it includes, and all files that its texts name, where they exist, also in LINGO_MI_DATA.
+    """A scene file, those that it includes, and all files that its texts name, if they exist, also in LINGO_MI_DATA.
 
     Raises
     ------
@@ -67,15 +67,15 @@ class _Reader:
     Parameters
     ----------
     values : dict[str, str]
-        Of the parameters.
+        Values of the scene parameters.
     folders : list[Path]
         In which names are looked for.
     scenes : set[Path]
         The files themselves.
     texts : set[str]
-        Of all strings.
+        Values of all strings.
     elements : int
-        Of all files so far.
+        Number of elements of all files so far.
     """
 
     values: dict[str, str]
@@ -142,7 +142,7 @@ class _Reader:
         return text
 
     def places(self, name: str) -> Iterator[Path]:
-        """The files that a name may mean. Mitsuba says where there is none."""
+        """The files that a name may mean. Mitsuba says if there is none."""
         for path in {(folder / name).absolute() for folder in self.folders}:
             if name and os.path.lexists(path) and not path.is_dir():
                 yield path
@@ -156,7 +156,7 @@ class _Reader:
 
 
 def _require_scene(path: Path):
-    """Raises InputError unless a path is that of a regular file of a size that scenes have."""
+    """Raises InputError unless a path names a regular file that is not larger than scenes are."""
     try:
         status = path.stat()
     except (OSError, ValueError):

@@ -39,9 +39,9 @@ def take_scan(
     volume : Volume or None
         `files.volumes.Volume` to scan instead of the scene's objects.
     seed : int
-        Of the detector's noise, if it has any.
+        Seed of the detector's noise, if it has any.
     truth : bool
-        Whether the data set gets the true volume, where that is known on the scanner's grid.
+        Whether the data set gets the true volume, if that is known on the scanner's grid.
     """
     scanner = loaded.scanner
     if volume is None and scanner.dataset is not None:

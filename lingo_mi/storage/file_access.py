@@ -40,7 +40,7 @@ def reading(path: PathLike | str, folder: bool = False) -> Iterator[None]:
     try:
         try:
             kind = os.stat(path).st_mode
-        except ValueError:  # a zero byte, or text that is no file name
+        except ValueError:  # a zero byte, or text that is not a file name
             raise InputError(f'{path}: is not a name of a file; correct it') from None
         if folder != stat.S_ISDIR(kind):
             what = 'a file, not a folder' if folder else 'a folder, not a file'
@@ -78,7 +78,7 @@ def parsed_json(text: str | bytes) -> Any:
 
 
 def read_json(path: PathLike | str) -> Any:
-    """What a JSON file says; None where it is no JSON.
+    """What a JSON file says; None if it is not JSON.
 
     Raises
     ------
@@ -132,7 +132,7 @@ _WINDOWS = sys.platform == 'win32'
 def _take_place(temporary, path):
     """Give a file or folder its name.
 
-    Windows refuses a name that an empty folder has, and, while another program reads it, that of a file.
+    Windows refuses a name that an empty folder has, and the name of a file while another program reads it.
     """
     if _WINDOWS:
         if path.is_dir():
@@ -172,7 +172,7 @@ def _flush(path):
 
 
 def flush_folder(path: PathLike | str) -> None:
-    """Wait until the names in a folder are on the disk, where the system can."""
+    """Wait until the names in a folder are on the disk, if the system can."""
     if not hasattr(os, 'O_DIRECTORY'):
         return
     folder = os.open(path, os.O_RDONLY | os.O_DIRECTORY)

@@ -32,12 +32,12 @@ def locked(folder: Path | str, name: str = LOCK) -> Iterator[None]:
     """Holds the lock of a folder, which is made if missing; folders that were made and are left empty are removed again.
 
     The system gives the lock back when its owner ends, however that ends. Where the file system has no such locks, the file
-    itself is the lock, and that of a dead process of this computer is taken over.
+    itself is the lock, and the lock of a dead process of this computer is taken over.
 
     Parameters
     ----------
     name : str
-        Of the lock file: another one where the folder holds files of several processes.
+        Name of the lock file, another one if the folder holds files of several processes.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def _take(path: Path, stack: ExitStack) -> None:
 
 
 def _hold(file: int) -> bool | None:
-    """Whether the system gives this process the lock; None where it has no such locks."""
+    """Whether the system gives this process the lock; None if it has no such locks."""
     try:
         if fcntl is None:
             return None
@@ -127,7 +127,7 @@ def _name_owner(file: int) -> None:
 
 
 def _owner(file: int) -> dict:
-    """Who has written the lock file; raises InputError where it is another program's file."""
+    """Who has written the lock file; raises InputError if it is another program's file."""
     os.lseek(file, 0, os.SEEK_SET)
     content = os.read(file, 4096)
     if not content:  # just made, or its owner was killed then

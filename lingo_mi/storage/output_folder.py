@@ -66,7 +66,7 @@ def manifest_of(folder: Path) -> Manifest:
 
 
 def require_ours(folder: Path, names: Iterable[str]) -> None:
-    """Raises InputError where one of the names is of a file in the folder that this program has not written, or of a link."""
+    """Raises InputError if one of the names is of a file in the folder that this program has not written, or of a link."""
     if os.path.lexists(folder / VIEWS) and ((folder / VIEWS).is_symlink() or not (folder / VIEWS).is_dir()):
         raise InputError(f'{folder / VIEWS}: is a link or a file, not a folder; move it away, or choose another folder')
     ours = manifest_of(folder).files
@@ -140,10 +140,10 @@ def digest(path: Path) -> str:
 
 
 def require_together(folder: Path, names: Iterable[str]) -> None:
-    """Raises InputError where files of these names in a folder are not of one result.
+    """Raises InputError if files of these names in a folder are not of one result.
 
-    That is so where metrics.json has other digests of them, and where a result is begun and not completed. Nothing is known of
-    files that were copied from their folder.
+    They are not if metrics.json has other digests of them, or if a result was begun and not completed. Files that were copied
+    from their folder are not checked.
     """
     path = folder / METRICS
     if not path.exists():

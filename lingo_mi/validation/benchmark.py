@@ -34,8 +34,8 @@ from lingo_mi.validation.pairs import count_pairs
 
 EPSILON = 0.0128  # mm, 1e-4 of half the volume's side: where the tree errs least
 VIEWS, WARM_UP = 8, 3
-TRIES = 5  # in a turn, of which the best counts, as in limit.cpp
-PIXELS = 400  # of which errors are measured
+TRIES = 5  # in a turn; the best of them counts, as in limit.cpp
+PIXELS = 400  # whose errors are measured
 KEYS = 'cloud.data', 'cloud.density'
 PASSES = 'forward', 'backward'
 TREE = 'bvh_forward_ms', 'bvh_backward_ms', 'bvh_image_error', 'bvh_gradient_error'
@@ -119,8 +119,8 @@ class Bench:
     def times(self) -> dict:
         """Milliseconds of both passes, ns a pair, and ns a pair of the hand-written kernel.
 
-        The kernel's are None on a GPU and where there is no g++. Integrator and kernel take turns, so that both see the same
-        machine; medians of the turns, in each of which the best of TRIES counts.
+        The kernel's are None on a GPU and if g++ is missing. Integrator and kernel take turns, so that both see the same
+        machine; medians of the turns; in each turn the best of TRIES counts.
         """
         work, pairs = self.work, self.pairs()
         upstream = dr.full(mi.TensorXf, 0.5, (work.size, work.size, 1))
@@ -205,7 +205,7 @@ def _timed(function, *arguments):
 
 
 def build_limit(folder: PathLike | str) -> Path | None:
-    """Compile limit.cpp into a folder; None where there is no compiler for it."""
+    """Compile limit.cpp into a folder; None if there is no compiler for it."""
     program = Path(folder) / 'limit'
     source = Path(str(resources.files('lingo_mi.validation') / 'limit.cpp'))
     command = ['g++', '-O3', '-march=native', '-pthread', str(source), '-o', str(program)]

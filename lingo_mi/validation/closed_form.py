@@ -41,7 +41,7 @@ def image_and_gradients(
     rays : Rays
         The view is its first one.
     shape : tuple[int, int]
-        Of the image, (v, u).
+        Shape of the image, (v, u).
     weights : ndarray [v, u] or None
         Or None for no derivatives: none in the dictionary.
     order : int

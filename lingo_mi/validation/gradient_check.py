@@ -5,7 +5,7 @@ differentiation are compared with
 
 - `ellipsoids`: central differences of the closed form in float64 NumPy, since those of a float32 image are mostly rounding; the
   cut-off is set to 8 standard deviations, because the closed form has none
-- `grids`: the image of one voxel of density 1 in an empty grid, minus that of the empty grid: integrals are linear in a grid, so
+- `grids`: the image of one voxel of density 1 in an empty grid, minus one of the empty grid: integrals are linear in a grid, so
   the only error of this large step is rounding
 
 For a scene in transmission, I = exp(-p), both use dL = -sum(weights * I * dp).
@@ -71,7 +71,7 @@ def check_gradients(scene: Any, step: float = 1e-4, count: int = 4, seed: int = 
     Parameters
     ----------
     step : float
-        Of the differences for ellipsoids, in parts of a Gaussian's smallest standard deviation (of the number itself for
+        Step of the differences for ellipsoids, in parts of a Gaussian's smallest standard deviation (of the number itself for
         densities).
     count : int
         Gaussians of every cloud and voxels of every grid to check, drawn with `seed` among those in view.

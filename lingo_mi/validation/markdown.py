@@ -66,7 +66,7 @@ def insert_into(document: Path, tables: dict[str, str]) -> None:
 
 
 def check_places(document: Path, names: Iterable[str]) -> None:
-    """Raises InputError where a document cannot be read or a table has no place in it: before hours of measuring."""
+    """Raises InputError if a document cannot be read or a table has no place in it: before hours of measuring."""
     insert(_read(document), dict.fromkeys(names, ''), document)
 
 

@@ -221,6 +221,6 @@ def pose_gradients(cloud: Cloud, pose: Pose, weights: np.ndarray) -> dict[str, n
 
 
 def relative(result: ArrayLike, expected: ArrayLike) -> float:
-    """Root mean square deviation over that of the expected values."""
+    """Root mean square deviation over the root mean square of the expected values."""
     result, expected = np.ravel(result), np.ravel(expected)
     return float(np.linalg.norm(result - expected) / np.linalg.norm(expected))

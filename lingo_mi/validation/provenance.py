@@ -26,7 +26,7 @@ def provenance(of: str | None = None) -> dict:
     """How what is measured now is made.
 
     - `command`: the command line
-    - `commit`: the commit of the checkout that `lingo_mi` runs from, with '+' where its files have changed; None where it is
+    - `commit`: the commit of the checkout that `lingo_mi` runs from, with '+' if its files have changed; None if it is
       installed
     - `date`: now, UTC, ISO 8601
     - `machine`: the processor's name
@@ -35,7 +35,7 @@ def provenance(of: str | None = None) -> dict:
     Parameters
     ----------
     of : str or None
-        The command line, where it is another process's.
+        The command line, if it is another process's.
     """
     return dict(
         command=of or command(),
@@ -55,7 +55,7 @@ def write_provenance(table: Path) -> Path:
 
 
 def commit() -> str | None:
-    """The commit of the checkout that `lingo_mi` runs from, and '+' if its files have changed since; None where it runs from no
+    """The commit of the checkout that `lingo_mi` runs from, and '+' if its files have changed since; None if it runs from no
     checkout of its own."""
     if not (ROOT / 'pyproject.toml').is_file():  # site-packages may lie in the checkout of another project
         return None

@@ -4,7 +4,7 @@
     python -m studies.benchmarks.field --rays 256 --samples 96 --repeats 10
 
 Both encode random rays' samples, run the network, sum along the rays, backpropagate the mean squared error to all parameters and
-take one step of Adam, at NAF's published size. They run in turns; the ratio is that of the medians over all turns, of seconds of
+take one step of Adam, at NAF's published size. They run in turns; the ratio is taken of the medians over all turns, of seconds of
 CPU and of seconds.
 """
 
@@ -84,7 +84,7 @@ class NumpyField:
     Parameters
     ----------
     dtype : type
-        Of all computations: float32 to be measured, float64 to be compared with.
+        Type of all computations: float32 to be measured, float64 to be compared with.
     """
 
     def __init__(self, options: Field, state: State, dtype: type = np.float32):

@@ -4,7 +4,7 @@
     python -m studies.benchmarks.functional --gaussians 50000 --pixels 512 --variant cuda_ad_mono
 
 Both project one view of a random cloud and backpropagate an image of random derivatives to the four parameters. They run in
-turns; the ratio is that of the medians over all turns.
+turns; the ratio is taken of the medians over all turns.
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ def model(geometry: Geometry, mbirjax: Any) -> Any:
     Raises
     ------
     InputError
-        For one that is not on a circle, or whose voxels are no cubes on the axis.
+        For one that is not on a circle, or whose voxels are not cubes on the axis.
     """
     if not isinstance(geometry, CircularGeometry) or geometry.mode != 'cone':
         raise InputError('MBIRJAX is compared with on circles of a cone beam only')

@@ -161,7 +161,7 @@ def scan(size: int, pixels: int, views: int) -> Geometry:
 
 
 def measured(geometry: Geometry, name: str, repeats: int) -> dict[str, Any] | None:
-    """A row of the table; None where the package is not installed."""
+    """A row of the table; None if the package is not installed."""
     package, make, slow = OPERATORS[name]
     part = geometry.subset([0]) if slow else geometry
     try:
@@ -231,7 +231,7 @@ def main() -> None:
     p.add_argument('--size', type=int, default=128, help='voxels along a side')
     p.add_argument('--pixels', type=int, default=256, help='pixels along a side')
     p.add_argument('--views', type=int, default=30)
-    p.add_argument('--repeats', type=int, default=3, help='calls of which the median is taken')
+    p.add_argument('--repeats', type=int, default=3, help='calls whose median is taken')
     p.add_argument('--only', nargs='+', choices=list(OPERATORS), default=list(OPERATORS), help='operators')
     p.add_argument('--out', type=Path, help='a folder, for operator.csv and its provenance')
     p.add_argument(

@@ -124,7 +124,7 @@ def ours(scan: Scan, volume: np.ndarray) -> Operations:
 
 
 def rtk(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
-    """RTK's operations, or None where it is not installed."""
+    """RTK's operations, or None if it is not installed."""
     try:
         itk: Any = importlib.import_module('itk')
         itk.RTK  # noqa: B018 - loads it
@@ -143,7 +143,7 @@ def rtk(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
 
 
 def diffct(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
-    """diffct's operations (PyTorch backend), or None where it is not installed."""
+    """diffct's operations (PyTorch backend), or None if it is not installed."""
     try:
         import torch
         from diffct import Projector  # pyright: ignore[reportMissingImports] - optional

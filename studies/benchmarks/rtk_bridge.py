@@ -45,7 +45,7 @@ def gantry(geometry: Geometry, itk: Any) -> Any:
 def require_every_pixel(scan: Scan, program: str) -> None:
     """Raises InputError for a scan with pixels that are not valid: the program would take them for air."""
     if scan.valid is not None:
-        raise InputError(f'{program} is compared with on scans of which every pixel is valid only')
+        raise InputError(f'{program} is compared only on scans whose pixels are all valid')
 
 
 def volume_image(volume: np.ndarray, geometry: Geometry, itk: Any) -> Any:

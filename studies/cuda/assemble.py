@@ -23,7 +23,7 @@ class Kernel:
     Parameters
     ----------
     name : str
-        Of the entry.
+        Name of the entry.
     test : str
         A test file that compiled it.
     sm : int

@@ -5,7 +5,7 @@
     python -m studies.cuda.count PROGRAM out/foot/checkpoint.npz out/chest/checkpoint.npz --json counts.json
 
 PROGRAM is a stand-in for the CUDA driver (see `studies.cuda`), which counts what warps do. Instructions are PTX's,
-without moves, most of which the assembler removes. A sector is 32 bytes, the least that memory moves.
+without moves, since the assembler removes most of them. A sector is 32 bytes, the least that memory moves.
 """
 
 from __future__ import annotations

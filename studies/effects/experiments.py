@@ -89,7 +89,7 @@ def measure(name: str, parameters: dict | None = None, method: Method = METHOD, 
     Parameters
     ----------
     parameters : dict or None
-        Of the scene file (`<default>` names).
+        Parameters of the scene file (`<default>` names).
 
     Returns
     -------
@@ -131,7 +131,7 @@ def measure(name: str, parameters: dict | None = None, method: Method = METHOD, 
 
 
 def scans(name: str, parameters: dict, seed: int) -> dict:
-    """A clean scan of an experiment's scene, a scan with its effect, and the truth [x, y, z], None where the grid is not the
+    """A clean scan of an experiment's scene, a scan with its effect, and the truth [x, y, z], None if the grid is not the
     object's own."""
     experiment, loaded = EXPERIMENTS[name], load_scene(scene_path(f'effects/{name}'), parameters)
     dataset = take_scan(loaded, seed=seed)

@@ -154,7 +154,7 @@ def run(
 
 
 def _chunk(child, name, seed, first, last, seconds):
-    """Has a child read the cases from `first` to before `last`. Returns the results by number, the child, None where it has died,
+    """Has a child read the cases from `first` to before `last`. Returns the results by number, the child, None if it has died,
     and the next case."""
     child.ask(f'{name}\t{seed}\t{first}\t{last}\n')
     at, patience, died = first - 1, seconds + 60, None  # the first case waits for the imports

@@ -55,7 +55,7 @@ class Result:
     Parameters
     ----------
     image : float or None
-        Relative error of the image or of the densities; None where nothing is compared.
+        Relative error of the image or of the densities; None if nothing is compared.
     gradients : dict[str, float]
         Relative errors of the derivatives by name.
     refused : str
@@ -105,7 +105,7 @@ def image_and_gradients(
     Parameters
     ----------
     shape : tuple[int, int]
-        Of the image, (v, u).
+        Shape of the image, (v, u).
     weights : ndarray [pixels]
     extent : float
         Cut-off in standard deviations.
@@ -190,7 +190,7 @@ def _measure_view(case):
 
 
 def _expected_image(cloud, pose):
-    """`oracle.line_integrals`, for large clouds a ray at a time, and the Gaussians of which derivatives are to be compared: as
+    """`oracle.line_integrals`, for large clouds a ray at a time, and the Gaussians whose derivatives are to be compared: as
     those do not depend on the others, of a large cloud the MOST_COMPARED that give most to the image."""
     if len(cloud) <= MOST_COMPARED:
         return oracle.line_integrals(cloud, pose), np.arange(len(cloud))

@@ -80,7 +80,7 @@ class Study:
         return f'{scan}{steps}'
 
     def get(self, case: Case, setting: str) -> dict | None:
-        """A stored cell, or None where there is none that can be read."""
+        """A stored cell, or None if there is none that can be read."""
         return self.cells.get(self.name(case), setting)
 
     def compute_missing(

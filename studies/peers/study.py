@@ -69,7 +69,7 @@ def _rtk_tv(scan: Scan, beta: float) -> np.ndarray:
 
 
 def _qggmrf(scan: Scan, sharpness: float) -> np.ndarray:
-    """Densities are not negative, as of SART and ASD-POCS."""
+    """Densities are not negative, as for SART and ASD-POCS."""
     return mbirjax_bridge.reconstruct(scan, _mbirjax(), sharpness=sharpness, positivity_flag=True)
 
 
@@ -189,7 +189,7 @@ def installed(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
 class Study:
     """The cells of one scan below a folder.
 
-    `compute_missing` raises InputError where the folder has the cells of another scan, and where there is nothing to compare
+    `compute_missing` raises InputError if the folder has the cells of another scan, and where there is nothing to compare
     with. A method that refuses the scan is left out, with a line that says why.
 
     Parameters
@@ -234,7 +234,7 @@ class Study:
         write_text(path, digest + '\n')
 
     def get(self, views: int, method: str) -> dict | None:
-        """A stored cell, or None where there is none that can be read."""
+        """A stored cell, or None if there is none that can be read."""
         return self.cells.get(_case(views), _file(method))
 
     def volume(self, views: int, method: str) -> np.ndarray:

@@ -57,7 +57,7 @@ class Comparison:
     views : int
         Fitted.
     iterations : int
-        Of all methods but `fast`, which keeps its own number, and those that name it themselves.
+        Iterations of all methods but `fast`, which keeps its own number, and those that name it themselves.
     changes : tuple[str, ...]
         'name=value', options of every fit or parameters of its scene.
     """

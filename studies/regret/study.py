@@ -87,7 +87,7 @@ class Study:
         return f'{case.object}_{self.size}_x{case.finer}_{case.views}_views_{case.photons:.17g}_photons'
 
     def get(self, case: Case, setting: str) -> dict | None:
-        """A stored cell, or None where there is none that can be read."""
+        """A stored cell, or None if there is none that can be read."""
         return self.cells.get(self.name(case), setting)
 
     def compute_missing(
@@ -173,7 +173,7 @@ class Study:
     def table(self, cases: Iterable[Case]) -> str:
         """The Markdown table of the cells that are there, a row a case: dB and processor seconds.
 
-        The regret of `Best` counts the fixed settings without a cloud; that of `Best(cloud=True)` counts all. Clouds have
+        The regret of `Best` counts the fixed settings without a cloud; the regret of `Best(cloud=True)` counts all. Clouds have
         columns where there are cells of them.
         """
         cases = list(cases)

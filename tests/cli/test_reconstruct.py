@@ -509,7 +509,7 @@ def test_views_that_repeat_each_other(dataset):
         return fitted_views(twice, geometry.joined(geometry).subset(views)).projections[:, 0, 0].tolist()
 
     assert found([0, 3, 6, 9, 12]) == [0, 3, 6, 9, 12] and found([3, 11, 4]) == [3, 11, 4]
-    with pytest.raises(InputError, match='not all of which'):
+    with pytest.raises(InputError, match='not all of them'):
         found([3, 3, 3])
 
 

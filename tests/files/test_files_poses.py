@@ -128,7 +128,7 @@ def test_a_matrix_is_parallel_to_rounding(step):
     P[0, 2, 0] = 0.5e-9 / step
     same_poses(matrices.from_matrices(P, SHAPE, (step, step), True), g.rays(), 1e-7 * step)
     P[0, 2, 0] = 2e-9 / step
-    with pytest.raises(InputError, match='no parallel beam'):
+    with pytest.raises(InputError, match='not belong to a parallel beam'):
         matrices.from_matrices(P, SHAPE, (step, step), True)
 
 
@@ -372,8 +372,8 @@ def test_bad_scanners(values, match):
         ('a.txt', '1 2\n3', 'not a table'),
         ('a.txt', '1 2 3', '12 numbers for every view'),
         ('a.npy', 'no', 'damaged'),
-        ('a.xml', '<a', 'is no XML'),
-        ('a.xml', '<a/>', 'is no RTKThreeD'),
+        ('a.xml', '<a', 'is not XML'),
+        ('a.xml', '<a/>', 'is not RTKThreeD'),
         ('a.xml', '<RTKThreeDCircularGeometry version="3"/>', 'no projections'),
         ('a.xml', RTK.replace('>30<', '>east<'), 'GantryAngle must be a finite number'),
         (
@@ -402,8 +402,8 @@ def test_bad_matrices(tmp_path):
     for bad, parallel, match in (
         (P[:, :2], False, r'\[view, 3, 4\]'),
         (P * np.nan, False, 'NaN'),
-        (P * [[1], [1], [0]], False, 'view 0 is that of no cone'),
-        (P, True, 'view 0 is that of no parallel'),
+        (P * [[1], [1], [0]], False, 'view 0 does not belong to a cone'),
+        (P, True, 'view 0 does not belong to a parallel'),
         (P * [[1], [0], [0]] + [0, 0, 0, 1.0], True, 'along one direction'),
     ):
         with pytest.raises(InputError, match=match):

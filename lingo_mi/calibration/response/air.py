@@ -1,7 +1,7 @@
 """Air level and gain of every view.
 
     m = p + a          a: what air measures; the tube's output is then exp(-a) times the assumed one
-    m = (1 + g) p      g: how much more strongly the view attenuates, as of a tube voltage that drifts
+    m = (1 + g) p      g: how much more strongly the view attenuates, as for a tube voltage that drifts
 
 A gain that all views have in common is the object's density; its mean is therefore held at 0.
 """

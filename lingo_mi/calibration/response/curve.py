@@ -1,4 +1,4 @@
-"""The curve between line integral and measured value, as of beam hardening by one material of an unknown spectrum.
+"""The curve between line integral and measured value, as for beam hardening by one material of an unknown spectrum.
 
     m = p + c2 p^2 + c3 p^3 + ...
 

@@ -28,7 +28,7 @@ class Response:
     Parameters
     ----------
     geometry : Geometry
-        Of the scan, whose views define the time (`calibration.drift.times`).
+        Geometry of the scan, whose views define the time (`calibration.drift.times`).
     parts : list[ResponsePart]
         With their numbers.
 

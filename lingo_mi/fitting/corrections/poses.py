@@ -127,7 +127,7 @@ class Poses:
 
 
 def place(view: View, rays: Rays) -> None:
-    """Set a `View`'s pose to that of `rays` [1] and enable its gradients."""
+    """Set a `View`'s pose to the pose of `rays` [1] and enable its gradients."""
     for name in _NAMES:
         vector = vector64(getattr(rays, name)[0])
         dr.enable_grad(vector)

@@ -12,7 +12,7 @@ from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Scan
 
 SHARE, ROOM = 0.9999, 1.5  # of the voxels of an FDK volume that are less dense; the bound, over the next
-THINNEST = 0.1  # way through the densest matter, in halves of the volume's longest side, where there is no FDK volume
+THINNEST = 0.1  # way through the densest matter, in halves of the volume's longest side, if there is no FDK volume
 VIEWS = 8  # that a mean is taken over, at most
 
 
@@ -40,8 +40,8 @@ def largest_density(scan: Scan) -> float:
 def mean_density(scan: Scan) -> float:
     """The mean of a scan's densities along its rays through the volume, 1/mm.
 
-    The sum of the line integrals over that of the ways: of a few evenly spaced views, and of their valid pixels. 0 where no ray
-    meets the volume.
+    The sum of the line integrals over the sum of the path lengths, for the valid pixels of a few evenly spaced views. It is 0 if
+    no ray meets the volume.
     """
     few = scan.subset(np.arange(min(len(scan), VIEWS)) * len(scan) // min(len(scan), VIEWS))
     ways = grid.project_volume(np.ones(few.geometry.grid.shape, np.float32), few.geometry).astype(float)

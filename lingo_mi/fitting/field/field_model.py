@@ -28,7 +28,7 @@ class FieldModel(Model):
     Parameters
     ----------
     options : Field
-        Of the field.
+        Options of the field.
     """
 
     def __init__(self, options: Field, geometry: Geometry, unit: float):

@@ -31,7 +31,7 @@ class FieldStepper(Stepper):
     model: FieldModel
 
     def __init__(self, method: Method, options: Field, normalise: bool, scan: Scan):
-        """options: of the field; normalise: as of `NAF`. Raises InputError for an empty scan."""
+        """options: of the field; normalise: as for `NAF`. Raises InputError for an empty scan."""
         self.method, self.options, self.scan, self.geometry = method, options, scan, scan.geometry
         self.model = FieldModel(options, scan.geometry, largest_density(scan) if normalise else 1.0)
         self.rows = view_table(scan.geometry)
@@ -76,7 +76,7 @@ class FieldStepper(Stepper):
     def _pixels(self, view: int, rng: np.random.Generator) -> np.ndarray:
         """Flat indices of `field_rays` valid pixels of a view behind the object, whose line integral is above 0 (NAF).
 
-        Where there are fewer, some are taken more than once; of a view that shows nothing, any valid pixels. None of a view
+        If there are fewer, some are taken more than once; of a view that shows nothing, any valid pixels. None of a view
         without those.
         """
         pixels = self.scan.projections[view].ravel()

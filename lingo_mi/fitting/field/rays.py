@@ -21,9 +21,9 @@ class FieldBox:
     Parameters
     ----------
     geometry : Geometry
-        Of the scan.
+        Geometry of the scan.
     side : float
-        Of the cube, in units of the volume's longest side.
+        Side of the cube, in units of the volume's longest side.
     """
 
     geometry: Geometry

@@ -47,7 +47,7 @@ class CloudMethod(Method):
     densify : Densify
         When Gaussians are added and removed, and how.
     bounds : ScaleBounds
-        Of the standard deviations.
+        Bounds of the standard deviations.
     normalise : bool
         Whether to fit in a unit of density that makes the largest line integral 1. SSIM's constants and the bounds then mean the
         same for any object. R2-Gaussian expects volumes in [0, 1] instead.

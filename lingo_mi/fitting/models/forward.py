@@ -28,7 +28,7 @@ class ForwardModel(ABC):
     Attributes
     ----------
     bounds : ScaleBounds
-        Of the standard deviations.
+        Bounds of the standard deviations.
     replayable
         Whether a view's loss and derivatives can be replayed (`projectors.replay`).
     """
@@ -92,7 +92,7 @@ class ForwardModel(ABC):
         Parameters
         ----------
         cut : Cuts or None
-            To backpropagate in parts, by its `pass_on`, where the model can.
+            To backpropagate in parts, by its `pass_on`, if the model can.
         """
 
     @abstractmethod

@@ -23,11 +23,11 @@ class Model(ABC):
     Attributes
     ----------
     geometry : Geometry
-        Of the scan, as given; defines the normalised frame and the default grid of `volume`.
+        Geometry of the scan, as given; defines the normalised frame and the default grid of `volume`.
     unit : float
         The density that the fit counts as 1, in 1/mm.
     effects : Effects or None
-        Of the scan, if the fit models them; None: projections are line integrals.
+        Effects of the scan, if the fit models them; None: projections are line integrals.
     response : Response or None
         What else the detector makes of line integrals, if that is fitted.
     """

@@ -31,7 +31,7 @@ class Part:
     CHOICES : dict
         By field: the texts that are allowed.
     name : str
-        Of a kind of this part, for command lines and files; '' if the part comes in one kind.
+        Name of a kind of this part, for command lines and files; '' if the part comes in one kind.
 
     Raises
     ------

@@ -28,9 +28,9 @@ class Sizes:
     points : tuple
         Gaussians a fit starts with.
     iterations : tuple
-        Of a fit.
+        Iterations of a fit.
     views : int
-        Of a fit, and as many held out.
+        Views of a fit, and as many held out.
     samples : tuple
         On a ray of a neural field.
     field_pixels : int

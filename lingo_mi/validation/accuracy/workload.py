@@ -14,7 +14,7 @@ from lingo_mi.validation.pairs import count_pairs
 
 DSO, DSD, PANEL = 7.8125, 11.71875, 4.0  # X3D's scanner, in units of half the volume's side
 BALL = 0.625  # radius of the ball of centres
-SPREAD = 1.16  # mean of a box's side over that of a Gaussian of the median scale
+SPREAD = 1.16  # mean of a box's side over the side for a Gaussian of the median scale
 
 
 class Workload:
@@ -23,7 +23,7 @@ class Workload:
     Parameters
     ----------
     order : int
-        Of the Gauss-Legendre rule for pixel means; 0 for the rays through pixel centres.
+        Order of the Gauss-Legendre rule for pixel means; 0 for the rays through pixel centres.
     giant : bool
         Whether the first Gaussian is as large as the whole ball.
     """

@@ -79,16 +79,16 @@ class Scale:
     n_points : int
         Gaussians that a fit starts with.
     iterations : tuple[int, ...]
-        Of the fits, where the user names none.
+        Iterations of the fits, if the user names none.
     objects : tuple[str, ...]
-        Where the user names none.
+        If the user names none.
     finer : int
         How many times as many voxels are scanned along each side, where the object has them: the projections then hold structure
         that the reconstructed voxels cannot.
     photons : float
         A pixel in the open beam, by which the views to fit are measured; 0: without noise.
     electronic_noise : float
-        Of the detector, standard deviation in photons.
+        Electronic noise of the detector, standard deviation in photons.
     longest : float
         Line integral of a scan, to which its density is scaled when photons are counted.
     first : bool
@@ -156,7 +156,7 @@ class Fit:
 class Volume:
     """A cell: a CT volume by one of ALGORITHMS, from the views of `fit`, completed from its cloud.
 
-    Where the fit's method is 'none', from these views alone; 'refined' and 'finer' start from the cloud's own volume.
+    If the fit's method is 'none', from these views alone; 'refined' and 'finer' start from the cloud's own volume.
     """
 
     fit: Fit
@@ -190,7 +190,7 @@ class Cells:
         self._completed = functools.lru_cache(1)(self._completed)
 
     def path(self, cell: Fit | Volume) -> Path:
-        """Where a cell is stored."""
+        """The file of a cell."""
         fit = cell.fit if isinstance(cell, Volume) else cell
         if self.scale.data:
             of_scan = dict(scan=scan_digest(scans_in(Path(self.scale.data))[fit.object]), seed=self.seed)
@@ -215,7 +215,7 @@ class Cells:
         return where / f'{fit.method.replace(":", "_")}_{_hash(of_scan | settings)}' / str(iterations) / 'fit.json'
 
     def folder_of(self, fit: Fit) -> Path:
-        """Where all fits of a method to an object's views are stored, and the volumes made of them."""
+        """The folder of all fits of a method to the views of an object, and of the volumes made of them."""
         if fit.method == 'none':
             return self.folder / fit.object / f'{fit.views}_views' / 'none'
         return self.path(fit).parents[1]
@@ -331,7 +331,7 @@ class Cells:
         )
 
     def _begin(self, method: Method, saved: Path):
-        """Without a whole checkpoint, copy that of the longest shorter fit of the same method, if its steps are ours."""
+        """Without a whole checkpoint, copy the one of the longest shorter fit of the same method, if its steps are ours."""
         if not method.extensible or _iterations(saved) is not None:
             return
         done = sorted(int(path.parent.name) for path in saved.parents[1].glob('*/fit.json'))
@@ -378,7 +378,7 @@ class Cells:
 
 
 def _iterations(path: Path) -> int | None:
-    """How far the fit of a checkpoint has come, or None where the file is missing or damaged."""
+    """How far the fit of a checkpoint has come, or None if the file is missing or damaged."""
     try:
         return Checkpoint.load(path).iteration
     except InputError:

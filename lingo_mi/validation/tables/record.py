@@ -16,7 +16,7 @@ class Record:
     Parameters
     ----------
     path : Path
-        Of the file, which need not exist.
+        Path of the file, which need not exist.
 
     Raises
     ------

@@ -114,7 +114,7 @@ def groups(
     Parameters
     ----------
     iterations : Sequence[int]
-        Of the fits; the last one counts for `ct` and `ablation`.
+        Iterations of the fits; the last one counts for `ct` and `ablation`.
     methods : Sequence[str]
         Columns of `views` and `ct`.
     algorithms : Sequence[str]
@@ -275,7 +275,7 @@ def _runs(column: Column, name: str, every: Sequence[Cells]) -> list[dict]:
 
 
 def _over(dicts: Sequence[dict], function: Callable) -> dict | None:
-    """A function of the values of each field; None where a value is missing."""
+    """A function of the values of each field; None if a value is missing."""
     if not dicts:
         return None
     fields = {field: [d[field] for d in dicts] for field in dicts[0]}
@@ -330,7 +330,7 @@ def write(table: str, table_groups: list[Group], objects: Iterable[str], every: 
     every : Sequence[Cells]
         The cells of each seed.
     name : str
-        Of the scale.
+        Name of the scale.
     """
     rows = results(table_groups, objects, every)
     planned = plan(table_groups, objects)
