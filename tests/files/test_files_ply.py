@@ -206,7 +206,7 @@ def test_elements_of_any_ply(tmp_path, kind, body):
         (b'element vertex 2', b'element vertex 999999999', 'more than its'),
         (b'element vertex 2', b'element vertex ' + b'9' * 30, 'no count'),
         (b'element vertex 2', b'element vertex', 'no count'),
-        (b'element vertex 2\n', b'', 'of no element'),
+        (b'element vertex 2\n', b'', 'to no element'),
         (b'element', b'end_header\nelement', 'no elements'),
         (b'end_header', b'', 'no end'),
         (b'ply', b'', 'does not begin'),
