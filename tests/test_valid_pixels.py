@@ -131,8 +131,14 @@ def brute_force(frames, found, points, misses, outside):
     return np.flatnonzero(keep)
 
 
-@pytest.mark.parametrize('outside', ['invalid', 'ignore'])
-@pytest.mark.parametrize('misses', [0, 1])
+@pytest.mark.parametrize(
+    'misses, outside',
+    [
+        (0, 'invalid'),
+        (1, 'ignore'),
+        *(pytest.param(*other, marks=pytest.mark.thorough) for other in ((0, 'ignore'), (1, 'invalid'))),
+    ],
+)
 def test_views_say_nothing_behind_invalid_pixels(scan, outside, misses):
     g, valid = scan.geometry, patches(scan)
     found = masks(spoilt(scan, valid, 1e9) * g.grid.scale, 0.1, valid)

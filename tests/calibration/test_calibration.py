@@ -110,7 +110,7 @@ def row_scan(mode, views, total, columns, told=0.0, true=0.0, width=1.4):
     ('mode', 'width', 'told', 'true'),
     [
         pytest.param('parallel', 0.63, -20, -22, marks=pytest.mark.thorough),  # half a fan
-        ('cone', 0.84, -20, -22),
+        pytest.param('cone', 0.84, -20, -22, marks=pytest.mark.thorough),
         pytest.param('cone', 0.56, 0, 0, marks=pytest.mark.thorough),  # a region of interest
         ('cone', 0.56, 0, -2),
         ('parallel', 3.6, 0, 22),  # far off

@@ -78,8 +78,10 @@ def test_form(made, name):
     assert made[name, 64].spacing == (side / 64,) * 3
 
 
-@pytest.mark.parametrize('name', phantoms.names())
-def test_seed(made, name):
+@pytest.mark.parametrize(
+    'name', [pytest.param(n, marks=pytest.mark.thorough) if n == 'chest' else n for n in phantoms.names()]
+)
+def test_seed(name):
     data = phantoms.make(name, 16).data
     forget()
     assert np.array_equal(phantoms.make(name, 16).data, data)
@@ -150,7 +152,7 @@ def test_chest_densities(made):
 # ---- exact projections -------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize('mode', ['cone', pytest.param('parallel', marks=pytest.mark.thorough)])
 @pytest.mark.parametrize('name', ['shepp_logan', 'gaussians', 'mesh'])
 def test_projections_against_line_sums(made, name, mode):
     phantom = made[name, 128]

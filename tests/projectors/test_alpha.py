@@ -110,7 +110,7 @@ def test_values_are_those_of_the_equations(mode, opacity):
     assert np.sort(error.ravel())[-3] < 2e-5 and error.max() < 1.1 / 255
 
 
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize('mode', ['cone', pytest.param('parallel', marks=pytest.mark.thorough)])
 def test_derivatives_are_those_of_differences(mode):
     g, c = geometry(mode), cloud(12, 3, (0.1, 0.9))
     frames, (height, width) = g.normalised_rays(), g.nDetector

@@ -35,7 +35,9 @@ def upright(mode, columns, offset):
     return geo, run_algorithm(ellipsoids(geo, *BODIES), FDK()).volume
 
 
-@pytest.mark.parametrize('columns, offset', [(72, -7.0), (40, 50.0), (40, -50.0)])
+@pytest.mark.parametrize(
+    'columns, offset', [(72, -7.0), (40, 50.0), pytest.param(40, -50.0, marks=pytest.mark.thorough)]
+)
 @pytest.mark.parametrize(
     'turn', ['yaw', 'all', *(pytest.param(t, marks=pytest.mark.thorough) for t in ('roll', 'pitch'))]
 )

@@ -259,7 +259,7 @@ def test_volume_alone(tmp_path):
     assert '"views"' not in page.read_text(encoding='utf-8').partition('id="known">')[2].partition('</script>')[0]
 
 
-@pytest.mark.parametrize('compared', [True, False])
+@pytest.mark.parametrize('compared', [True, pytest.param(False, marks=pytest.mark.thorough)])
 def test_fan_beam(compared):
     """One slice, shown large with its truth beside it, and views as lines."""
     shape = (20, 16, 1)

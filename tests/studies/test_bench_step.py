@@ -28,6 +28,7 @@ def test_parts_of_a_step(tmp_path):
     )
 
 
+@pytest.mark.thorough
 def test_a_loss_of_one_part(tmp_path):
     """It cannot be left out: a step would compare nothing."""
     alone = dict(lambda_l1=0, lambda_ssim=0, lambda_gradient=1, lambda_tv=0)

@@ -25,6 +25,7 @@ def fan(views=60):
     return lm.Dataset(scan.subset(slice(0, None, 2)), scan.subset(slice(1, None, 2)))
 
 
+@pytest.mark.thorough
 def test_a_drift_is_what_explains_it(tmp_path):
     dataset = fan()
     calibration = lm.calibrate(dataset, drift=3, progress=False)

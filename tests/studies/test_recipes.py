@@ -55,6 +55,7 @@ def fits(monkeypatch):
     return commands
 
 
+@pytest.mark.thorough
 def test_a_fit_of_other_settings_is_another(recipes, fits, tmp_path):
     def asked(*args):
         fits.clear()
