@@ -50,7 +50,7 @@ class Scan:
     Raises
     ------
     InputError
-        If their shapes are not the geometry's, where a valid pixel is not finite, where no pixel is valid, and for effects on a
+        If their shapes are not the geometry's, if a valid pixel is not finite, if no pixel is valid, and for effects on a
         curved panel.
 
     Examples
@@ -146,7 +146,7 @@ class Scan:
     def to_flat(self) -> Scan:
         """The scan on a flat panel, `CurvedGeometry.to_flat`, for what knows no curved ones; a scan with a flat panel as it is.
 
-        Line integrals are interpolated along rows and columns: by cubic splines, or linearly where some pixels are not valid. A
+        Line integrals are interpolated along rows and columns: by cubic splines, or linearly if some pixels are not valid. A
         pixel with such a neighbour is not valid.
 
         Raises

@@ -24,7 +24,7 @@ WIDER, MARGIN = 1.5, 1.15  # how much larger the volume then is, and otherwise: 
 def coarse(scan: Scan, pixels: int) -> Scan:
     """The scan binned to about `pixels` columns and smoothed, on voxels as wide as a pixel at the axis.
 
-    Where the object reaches over the panel's edge, the volume is wider, so that there is room for what lies beyond.
+    If the object reaches over the panel's edge, the volume is wider, so that there is room for what lies beyond.
     """
     small = _binned(scan, max(1, round(max(scan.geometry.nDetector) / pixels)))
     g = small.geometry
@@ -44,7 +44,7 @@ def coarse(scan: Scan, pixels: int) -> Scan:
 
 
 def _binned(scan: Scan, factor: int) -> Scan:
-    """The scan binned by the means of valid pixels; new pixels are valid where half of theirs are."""
+    """The scan binned by the means of valid pixels; a new pixel is valid if half of its pixels are."""
     if scan.valid is None:
         return scan.binned(factor)
     valid = scan.valid.astype(np.float32)
@@ -56,7 +56,7 @@ def _binned(scan: Scan, factor: int) -> Scan:
 def _smoothed(scan):
     """The projections, each pixel a weighted mean of valid ones.
 
-    A slope goes on beyond the panel's edge: where the object reaches over it, anything else would be taken for a shift.
+    A slope goes on beyond the panel's edge: if the object reaches over it, anything else would be taken for a shift.
     """
     valid = np.ones(scan.projections.shape, np.float32) if scan.valid is None else scan.valid.astype(np.float32)
     by = [0.0, *(SMOOTH if n > 2 else 0.0 for n in scan.geometry.nDetector)]

@@ -36,7 +36,7 @@ def order_faults(scan: Scan) -> list[str]:
     Raises
     ------
     InputError
-        For a scan without signal, and where the source lies within the volume.
+        For a scan without signal, and if the source lies within the volume.
 
     Examples
     --------
@@ -55,7 +55,7 @@ def order_faults(scan: Scan) -> list[str]:
     signal = np.sqrt(np.square(small.projections).mean())
 
     def times(order):
-        """How many times larger the differences are where the views of this order have the places of the given ones."""
+        """How many times larger the differences are if the views of this order take the places of the original ones."""
         return np.sqrt(np.square(_differences(replace(small.subset(order), geometry=small.geometry))).mean()) / total
 
     if total > ROUND * signal and times(shuffled) < WORSE:

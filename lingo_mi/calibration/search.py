@@ -3,7 +3,7 @@
 Every view is predicted from a quick reconstruction of other views (`cross_prediction`). With r the differences to what was
 measured, as a function of the numbers sought, and D the derivatives of r by differences (of the whole chain, each with two
 reconstructions of its own), a step is a Gauss-Newton step, -(D D^T)^-1 D r. The shift along u is first looked for on
-a grid of trials, a wide one where no minimum is clear.
+a grid of trials, a wide one if no minimum is clear.
 
 The panel moves, and the images stay as they were measured. So all pixels count in all trials: if images were moved instead, those
 of an object that reaches over the panel's edge would lose or gain pixels, and the smallest sum would have the fewest.
@@ -13,7 +13,7 @@ Standard errors are those of clustered observations,
     K / (K - 1)  (D D^T)^-1  (sum over K clusters of g g^T)  (D D^T)^-1,   g = D r of a cluster
 
 (Liang and Zeger, Biometrika 73, 1986). Clusters are single views, which noise makes differ; the halves that predict each other;
-and spans of the scan's time, which differ where the scanner changes. The largest counts. A constant shift along v is not sought:
+and spans of the scan's time, which differ if the scanner changes. The largest counts. A constant shift along v is not sought:
 the image moves by it almost as if the object had moved along the axis.
 """
 
@@ -176,9 +176,7 @@ def search(
     small = [name for name in names if not abs(here[name]) > SURE * errors[name]]
     refused = dict.fromkeys(small, 'it is less than three standard errors')
     if not between:
-        refused |= dict.fromkeys(
-            names, 'the axis lies beyond where it was looked for: check offDetector and the angles'
-        )
+        refused |= dict.fromkeys(names, 'the axis lies outside the searched range: check offDetector and the angles')
     chosen, best = here, r
     while True:
         sure = [name for name in names if name not in refused]

@@ -9,7 +9,7 @@ The list is a CSV file whose first line names its columns; an empty cell is the 
     file       projections, as for `lingo-mi fit --projections`; with a scene in geometry, a CT volume that its scanner scans
     geometry   the geometry file (.yml) of an .npy; or a scene, .xml or a shipped one, whose own object is scanned without a file
     name       of the folder in --out (default: the name of the file)
-    method, views, seed, mu_water   as of `lingo-mi fit`
+    method, views, seed, mu_water   as for `lingo-mi fit`
     any option of the row's method, such as iterations or lambda_tv, or parameter of its scene
 
 The whole list is checked first: every row that cannot be used gets a line, and nothing is begun. Then each scan is fitted into

@@ -29,7 +29,7 @@ def parser() -> Parser:
         '--mu-water',
         type=float,
         metavar='MU',
-        help='where the truth has Hounsfield units: the attenuation of water, 1/mm, that the results were made with',
+        help='if the truth has Hounsfield units: the attenuation of water, 1/mm, that the results were made with',
     )
     spacing_argument(p, '--truth')
     p.add_argument(

@@ -6,7 +6,7 @@
     lingo-mi fit foot_50.pickle
 
 The scene says what is scanned and by which scanner; the projections are rendered from its object. A file of measured ones takes
-its place, or with --projections that of the object alone, where a scene's tube and detector are to be modelled. A cloud is
+its place, or with --projections that of the object alone, if a scene's tube and detector are to be modelled. A cloud is
 started from the projections, fitted, and written to the output folder with a report (report.html), a volume in mm
 (volume.nii.gz), the Gaussians (gaussians.ply), a scene of them (result.xml), held-out views and metrics.json. The baselines 3dgs
 and xgaussian make neither volume nor scene; naf makes no Gaussians, and a scene of its volume.

@@ -3,7 +3,7 @@
     lingo-mi gradcheck gaussians
     lingo-mi gradcheck my_scene.xml -n 20 --variant llvm_ad_rgb
 
-The exit code is 1 where an error is above 1e-4, and 2 for a scene that cannot be checked.
+The exit code is 1 if an error is above 1e-4, and 2 for a scene that cannot be checked.
 """
 
 import argparse

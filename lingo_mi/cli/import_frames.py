@@ -38,7 +38,7 @@ def parser() -> Parser:
         required=True,
         type=Path,
         metavar='F.npy',
-        help='the scan; F.yml is written beside it, F.valid.npy where pixels are not valid, and F.poses.npy for many poses',
+        help='the scan; F.yml is written beside it, F.valid.npy if pixels are not valid, and F.poses.npy for many poses',
     )
     add('--flats', metavar='F', help='frames without object')
     add('--darks', metavar='F', help='frames without beam')

@@ -101,7 +101,7 @@ def make_tables(
     Raises
     ------
     InputError
-        After everything else is done where cells could not be computed.
+        After everything else is done, if cells could not be computed.
     """
     from lingo_mi.validation.tables.cells import SCANNED, Cells
     from lingo_mi.validation.tables.record import Record

@@ -28,7 +28,7 @@ def _installed(package: str) -> str:
 
 
 def _llvm() -> str:
-    """The version of LLVM that Dr.Jit has loaded, and the library's path where it is known."""
+    """The version of LLVM that Dr.Jit has loaded, and the library's path if it is known."""
     import drjit as dr
 
     if not dr.has_backend(dr.JitBackend.LLVM):

@@ -24,7 +24,7 @@ MOST_NAME = 100  # bytes of a name
 _ENDINGS = '.nii.gz', '.npy.gz', '.raw.gz'
 _NAME = re.compile(
     r'\w(?:[\w .+,=@()-]*[\w)+@-])?'
-)  # a name of a folder on any system, which is no option of a command
+)  # a name of a folder on any system, which is not an option of a command
 _DEVICES = re.compile(r'(con|prn|aux|nul|com\d|lpt\d)(\..*)?', re.IGNORECASE)  # of Windows
 
 
@@ -42,7 +42,7 @@ def read_list(path: PathLike | str, method: str = 'fast') -> list[Row]:
        The first line names the columns (`row.COLUMNS`, options of methods, parameters of scenes). An empty cell is the default.
        Relative paths begin from the list's folder.
 
-       Raises InputError where the file is no such list, and `BadList` for rows that cannot be used.
+       Raises InputError if the file is not such a list, and `BadList` for rows that cannot be used.
 
            rows = read_list('cohort.csv')   # file,views
     foot.pickle,25
@@ -65,9 +65,7 @@ def read_list(path: PathLike | str, method: str = 'fast') -> list[Row]:
             where += f' ({row.name})'
             key = unicodedata.normalize('NFC', row.name).casefold()  # some file systems do not tell them apart
             if key in names:
-                raise InputError(
-                    f'the name is also that of line {names[key]}; give each row another one, in a column name'
-                )
+                raise InputError(f'line {names[key]} has the same name; give each row another one, in a column name')
             names[key] = line
             _check(row)
         except InputError as error:
@@ -93,16 +91,16 @@ def _records(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     first = next((line for line in text.splitlines() if line.strip()), '')
     reader = csv.reader(io.StringIO(text, newline=''), delimiter=max(',;\t', key=first.count), strict=True)
     try:
-        found = [(reader.line_num, cells) for cells in reader if any(map(str.strip, cells))]
+        records = [(reader.line_num, cells) for cells in reader if any(map(str.strip, cells))]
     except csv.Error as error:
-        raise InputError(f'{path}, line {reader.line_num}: is no CSV ({error}); mend its quotes') from None
-    if not found:
+        raise InputError(f'{path}, line {reader.line_num}: is not CSV ({error}); mend its quotes') from None
+    if not records:
         raise InputError(f'{path}: is empty; its first line must name the columns, such as file,geometry,views')
-    header = [name.strip() for name in found[0][1]]
+    header = [name.strip() for name in records[0][1]]
     _check_header(path, header)
-    if len(found) == 1:
+    if len(records) == 1:
         raise InputError(f'{path}: has a header, but no scan below it')
-    return header, found[1:]
+    return header, records[1:]
 
 
 def _check_header(path: Path, header: list[str]) -> None:
@@ -118,35 +116,35 @@ def _check_header(path: Path, header: list[str]) -> None:
 
 
 def _row(cells: dict[str, str], line: int, folder: Path, method: str) -> Row:
-    given = {name: text for name, text in cells.items() if text}
-    own = {name: given.pop(name) for name in COLUMNS if name in given}
-    file, geometry = own.get('file', ''), own.get('geometry', '')
+    values = {name: text for name, text in cells.items() if text}
+    columns = {name: values.pop(name) for name in COLUMNS if name in values}
+    file, geometry = columns.get('file', ''), columns.get('geometry', '')
     if not (file or geometry):
         raise InputError('names neither a file nor a scene')
     scene = scene_of(folder, geometry)
     of_scene = _parameters(scene) if scene else frozenset()
-    method = own.get('method', method)
-    settings = {name: text for name, text in given.items() if name not in of_scene}
-    known = known_options(method, settings)
+    method = columns.get('method', method)
+    settings = {name: text for name, text in values.items() if name not in of_scene}
+    accepted = known_options(method, settings)
     for name in settings:
-        if name not in known:
+        if name not in accepted:
             raise InputError(
                 f'{shown(name)} is neither a column of a list ({", ".join(COLUMNS)}) nor an option of {shown(method)}'
                 + (f' nor a parameter of {geometry}' if scene else '')
-                + nearest(name, [*COLUMNS, *known, *of_scene])
+                + nearest(name, [*COLUMNS, *accepted, *of_scene])
             )
     return Row(
-        name=own.get('name') or _stem(file or str(scene)),
+        name=columns.get('name') or _stem(file or str(scene)),
         line=line,
         folder=str(folder.resolve()),
         file=file,
         geometry=geometry,
         method=method,
-        views=_whole('views', own['views'], 1) if 'views' in own else None,
-        seed=_whole('seed', own.get('seed', '0'), 0),
-        mu_water=_positive('mu_water', own['mu_water']) if 'mu_water' in own else None,
+        views=_whole('views', columns['views'], 1) if 'views' in columns else None,
+        seed=_whole('seed', columns.get('seed', '0'), 0),
+        mu_water=_positive('mu_water', columns['mu_water']) if 'mu_water' in columns else None,
         settings=settings,
-        parameters={name: text for name, text in given.items() if name in of_scene},
+        parameters={name: text for name, text in values.items() if name in of_scene},
     )
 
 
@@ -159,7 +157,7 @@ def _check(row: Row) -> None:
             'in a column name'
         )
     if name.casefold() in RESERVED:
-        raise InputError('the name is that of a file of the batch; choose another, in a column name')
+        raise InputError('a file of the batch has this name; choose another, in a column name')
     row.fit_method()
     path = row.path
     if path is not None:

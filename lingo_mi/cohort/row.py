@@ -74,7 +74,7 @@ class Row:
 
     @property
     def scene(self) -> Path | None:
-        """The file of the scene; None where the geometry is none.
+        """The file of the scene; None if the geometry is not a scene.
 
         Raises
         ------
@@ -99,15 +99,15 @@ class Row:
         path = self.path
         size = path.stat().st_size if path is not None and path.is_file() else None
         settings = _asked(self.fit_method())
-        kept = {k: v for k, v in asdict(self).items() if k not in ('line', 'folder', 'settings')}
+        request = {k: v for k, v in asdict(self).items() if k not in ('line', 'folder', 'settings')}
         geometry = Path(self.folder) / self.geometry
         if self.geometry and geometry.is_file():  # else it is the name of a shipped scene
-            kept[CONTENT] = hashlib.sha256(geometry.read_bytes()).hexdigest()
+            request[CONTENT] = hashlib.sha256(geometry.read_bytes()).hexdigest()
         if path is not None and path.exists():
-            kept[SCAN] = _digest(_files(path, geometry if self.geometry else None))
+            request[SCAN] = _digest(_files(path, geometry if self.geometry else None))
         if others := self._named():
-            kept[NAMED] = _digest(others)
-        return json.loads(json.dumps(kept | dict(bytes=size, settings=settings)))  # as a file has it
+            request[NAMED] = _digest(others)
+        return json.loads(json.dumps(request | dict(bytes=size, settings=settings)))  # as a file has it
 
     def _named(self):
         """The files that the geometry names and the numbers depend on."""
@@ -152,13 +152,13 @@ def _digest(files):
 @lru_cache(maxsize=1024)
 def _digest_of(files):
     """Of the contents of (file, size, time of change): a file that has not changed is read once."""
-    found = hashlib.sha256()
+    hasher = hashlib.sha256()
     for file, *_ in files:
-        found.update(file.name.encode(errors='surrogateescape'))
+        hasher.update(file.name.encode(errors='surrogateescape'))
         with open(file, 'rb') as stream:
             while part := stream.read(2**24):
-                found.update(part)
-    return found.hexdigest()
+                hasher.update(part)
+    return hasher.hexdigest()
 
 
 def _asked(method):
@@ -167,7 +167,7 @@ def _asked(method):
 
 
 def stored(out: Path, row: Row) -> dict | None:
-    """The metrics of a row's whole result in the folder `out`; None where it has not been completed.
+    """The metrics of a row's whole result in the folder `out`; None if it has not been completed.
 
     Raises
     ------
@@ -187,13 +187,13 @@ def stored(out: Path, row: Row) -> dict | None:
         return None
     try:
         with reading(folder / METRICS):
-            found = parsed_json((folder / METRICS).read_text(encoding='utf-8'))
-        files, asked = found['files'], found.get('request')
+            metrics = parsed_json((folder / METRICS).read_text(encoding='utf-8'))
+        files, asked = metrics['files'], metrics.get('request')
         before = asked['settings'].items() if isinstance(asked, dict) else ()
     except (KeyError, TypeError, AttributeError, ValueError):
         raise InputError(f'{folder / METRICS}: is damaged; remove the folder, or give another name') from None
     if not isinstance(asked, dict):
-        raise InputError(f'{folder}: holds a result that is none of a list; give another name')
+        raise InputError(f'{folder}: holds a result that no list made; give another name')
     wanted = row.request()
     if changed := [k for k in wanted if asked.get(k) != wanted[k]]:
         if changed == ['settings']:
@@ -204,4 +204,4 @@ def stored(out: Path, row: Row) -> dict | None:
     missing = [name for name in files if not (folder / name).exists()]
     if missing:
         raise InputError(f'{folder / missing[0]}: is missing from a whole result; remove the folder, to fit it again')
-    return found
+    return metrics

@@ -27,18 +27,18 @@ class Outcome:
 def done_already(rows: Sequence[Row], out: Path) -> dict[str, dict]:
     """The metrics of the rows whose results are in the folder `out`, by name.
 
-    Raises `BadList` where a row's folder holds something else.
+    Raises `BadList` if a row's folder holds something else.
     """
-    found, bad = {}, []
+    done, bad = {}, []
     for row in rows:
         try:
             if (numbers := stored(out, row)) is not None:
-                found[row.name] = numbers
+                done[row.name] = numbers
         except InputError as error:
             bad.append(printable(f'line {row.line} ({row.name}): {error}'))
     if bad:
         raise BadList(f'{out}: {len(bad)} of {len(rows)} rows cannot be used, so nothing was begun', bad)
-    return found
+    return done
 
 
 def run_cohort(rows: Sequence[Row], out: Path, runner: Runner, done: dict[str, dict]) -> Outcome:
@@ -49,14 +49,14 @@ def run_cohort(rows: Sequence[Row], out: Path, runner: Runner, done: dict[str, d
     Parameters
     ----------
     done : dict[str, dict]
-        As of `done_already`.
+        As `done_already` returns them.
     """
     for leftover, target in leftovers(out):
         if target in (CSV, PARQUET):  # the lock is ours
             leftover.unlink(missing_ok=True)
     table, log, numbers = Table(out, rows), Log(out), dict(done)
-    for name, found in done.items():
-        table.done(name, found)
+    for name, metrics in done.items():
+        table.done(name, metrics)
     table.renew()  # a log without a table would be a stranger's
     log.add(f'batch of {len(rows)} scans, {len(done)} of them done')
 

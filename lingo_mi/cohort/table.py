@@ -1,4 +1,4 @@
-"""The table of a cohort's results: CSV, and Parquet where pyarrow is installed."""
+"""The table of a cohort's results: CSV, and Parquet if pyarrow is installed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Table:
     """One row a scan: what was asked for, its status, and every number of its result."""
 
     def __init__(self, out: Path, rows: Iterable[Row]):
-        """Raises InputError where a file of the table's name is not ours."""
+        """Raises InputError if a file of the table's name is not ours."""
         self.out, self._written = out, -PAUSE
         self._rows = {row.name: self._asked(row) for row in rows}
         path = out / CSV
@@ -32,18 +32,18 @@ class Table:
                     raise InputError(f'{path}: is not a table of a batch; move it away, or choose another folder')
         for other in (out / PARQUET, out / LOG):
             if other.is_symlink() or other.exists() and not (path.exists() and other.is_file()):
-                raise InputError(f'{other}: is not that of a batch; move it away, or choose another folder')
+                raise InputError(f'{other}: does not belong to a batch; move it away, or choose another folder')
 
     @staticmethod
     def _asked(row: Row) -> dict:
-        kept = {name: getattr(row, name) for name in FIRST if name not in ('status', 'error')}
-        return kept | dict(status='waiting', error=None) | row.settings | row.parameters
+        columns = {name: getattr(row, name) for name in FIRST if name not in ('status', 'error')}
+        return columns | dict(status='waiting', error=None) | row.settings | row.parameters
 
     def done(self, name: str, numbers: dict) -> None:
-        """Enter the metrics of a result; those that are no numbers are left out."""
+        """Enter the metrics of a result; values that are not numbers are left out."""
         asked = self._rows[name]
-        found = {k: v for k, v in numbers.items() if isinstance(v, int | float) and not isinstance(v, bool)}
-        self._rows[name] = asked | found | dict(status='done', error=None)
+        scalars = {k: v for k, v in numbers.items() if isinstance(v, int | float) and not isinstance(v, bool)}
+        self._rows[name] = asked | scalars | dict(status='done', error=None)
 
     def state(self, name: str, status: str, error: str | None = None) -> None:
         self._rows[name] |= dict(status=status, error=error)
@@ -81,7 +81,7 @@ class Table:
 
 
 def _alike(values: list) -> list:
-    """Values of one column: all as text where one is, since a list gives as text what a result gives as a number."""
+    """Values of one column: all as text if one is, since a list gives as text what a result gives as a number."""
     text = any(isinstance(value, str) for value in values)
     return [None if value is None else str(value) for value in values] if text else values
 

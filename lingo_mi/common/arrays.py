@@ -12,7 +12,7 @@ from lingo_mi.common.errors import InputError
 
 
 def as_numpy(values: Any, name: str, dtype: DTypeLike | None = None) -> np.ndarray:
-    """`values` as an array, without a copy where that is possible.
+    """`values` as an array, without a copy if that is possible.
 
     Parameters
     ----------

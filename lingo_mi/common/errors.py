@@ -25,7 +25,7 @@ def brief(text: object, longest: int = LONGEST) -> str:
 
 
 def shown(value: object) -> str:
-    """The start of a value's repr, for messages that quote what a file says; its type where it has none."""
+    """The start of a value's repr, for messages that quote what a file says; its type if it has none."""
     try:
         text = repr(value)
     except (ValueError, RecursionError, MemoryError):  # an integer of too many digits

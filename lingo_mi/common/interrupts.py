@@ -41,7 +41,7 @@ def between_steps() -> Iterator[Callable[[], None]]:
 
 @contextmanager
 def noticed() -> Iterator[None]:
-    """Raises KeyboardInterrupt where Ctrl-C was pressed within the block, whatever a library has made of it there.
+    """Raises KeyboardInterrupt if Ctrl-C was pressed within the block, whatever a library has made of it there.
 
     Mitsuba turns an exception of a plugin into a RuntimeError of its own, whose text depends on where it was raised.
     """

@@ -17,8 +17,8 @@ from lingo_mi.common.gpu import gpu
 
 
 def room() -> float:
-    """Bytes: the GPU's memory where a variant for CUDA is active. Else the smallest of the machine's memory, the limits of the
-    control groups that this process is in, and what its limit of address space leaves; infinity where none of them is known."""
+    """Bytes: the GPU's memory if a variant for CUDA is active. Else the smallest of the machine's memory, the limits of the
+    control groups that this process is in, and what its limit of address space leaves; infinity if none of them is known."""
     if sys.modules.get('mitsuba') and (sys.modules['mitsuba'].variant() or '').startswith('cuda'):
         return gpu().memory
     return host_room()
@@ -26,12 +26,12 @@ def room() -> float:
 
 def host_room() -> float:
     """Bytes: the smallest of the machine's memory, the limits of the control groups that this process is in, and what its
-    limit of address space leaves; infinity where none of them is known."""
+    limit of address space leaves; infinity if none of them is known."""
     return min(psutil.virtual_memory().total, *_control_groups(), _address_space())
 
 
 def require_room(needed: float, where: PathLike | str) -> None:
-    """Raises InputError, in the name of a file, where reading it would need more bytes than this process may take."""
+    """Raises InputError, in the name of a file, if reading it would need more bytes than this process may take."""
     if needed > (room := host_room()):
         raise InputError(
             f'{where}: says that it needs {needed / 2**30:,.1f} GiB of memory, but this process may take '

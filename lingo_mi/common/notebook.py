@@ -98,7 +98,7 @@ def slices(volume: np.ndarray, spacing: ArrayLike, centre: ArrayLike = (0, 0, 0)
 
 
 def grey_range(*arrays: np.ndarray) -> tuple[float, float]:
-    """A common grey scale, by the last array: from 0, or from the 0.1th percentile where that is negative, to the 99.9th.
+    """A common grey scale, by the last array: from 0, or from the 0.1th percentile if that is negative, to the 99.9th.
 
     If few values are not 0, to the largest of all arrays.
     """

@@ -21,7 +21,7 @@ LABELS = {
 }
 REDRAW = 0.25  # seconds between two redraws on a terminal
 PAUSE = 1.0  # seconds between two plain lines at least, but for the last
-LINE = 10.0  # seconds between two plain lines, where 10 % takes longer
+LINE = 10.0  # seconds between two plain lines, if 10 % takes longer
 
 
 class Progress:
@@ -144,7 +144,7 @@ def _text(name, value):
 
 
 def clock(seconds: float) -> str:
-    """A time as minutes and seconds, 1:05, with hours where there are any."""
+    """A time as minutes and seconds, 1:05, with hours if there are any."""
     minutes, seconds = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f'{hours}:{minutes:02d}:{seconds:02d}' if hours else f'{minutes}:{seconds:02d}'

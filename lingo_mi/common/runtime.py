@@ -185,7 +185,7 @@ def use_variant(name: str | None = None) -> str:
 
 
 def ensure_variant(device: str | None = None) -> str:
-    """The name of the active Mitsuba variant, with derivatives; chooses one (`use_variant`) where none is active yet.
+    """The name of the active Mitsuba variant, with derivatives; chooses one (`use_variant`) if none is active yet.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def ensure_variant(device: str | None = None) -> str:
     Raises
     ------
     InputError
-        If no such variant can run, or where the active one works on another device.
+        If no such variant can run, or if the active one works on another device.
     """
     import mitsuba as mi
 

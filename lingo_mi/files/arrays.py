@@ -79,7 +79,7 @@ def _numpy_load(path, kind):
 
 
 def _check_claims(path):
-    """Raises InputError or ValueError where an array's header claims more than the file holds, or more than the memory does."""
+    """Raises InputError or ValueError if an array's header claims more than the file holds, or more than the memory does."""
     if not zipfile.is_zipfile(path):
         with open(path, 'rb') as stream:
             require_room(_claimed(stream, os.path.getsize(path)), path)

@@ -23,12 +23,12 @@ SPACE = 'x', 'y', 'z'
 
 
 def read_ome_zarr(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
-    """The values [x, y, z], the affine [4, 4] in mm, and a description where the file is of ours, else ''.
+    """The values [x, y, z], the affine [4, 4] in mm, and a description if the file is ours, else ''.
 
     Raises
     ------
     InputError
-        If the folder is damaged, another one, or has several values a voxel; and where zarr is missing.
+        If the folder is damaged, another one, or has several values a voxel; and if zarr is missing.
     """
     zarr = optional('zarr', 'ome-zarr')
 
@@ -61,7 +61,7 @@ def read_ome_zarr(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
             fail(f'has values of the type {dtype} in the shape {list(shape)}, not one number a voxel')
         if any(n != 1 for n, name in zip(shape, names) if name not in SPACE) or min(shape) < 1:
             fail(f'has the shape {list(shape)} along {" ".join(names)}; a single volume is needed')
-        # A piece is unpacked whole, also where it is larger than the array.
+        # A piece is unpacked whole, even if it is larger than the array.
         together = math.prod(map(max, shape, _piece(array)))
         require_room(together * (dtype.itemsize + 8), path)
         try:

@@ -216,7 +216,7 @@ def _header(stream, where):
 
 def require_elements(path: PathLike | str) -> None:
     """Raises InputError unless a PLY file of any kind has a header with elements, and room for them: Mitsuba's readers end the
-    process where there are none."""
+    process if there are none."""
 
     def fail(what):
         raise InputError(f'{path}: is a damaged PLY file: {what}; write it again')

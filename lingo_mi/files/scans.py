@@ -22,7 +22,7 @@ degrees:
     poses                  instead of DSO, DSD, angles and the offsets: a list of 12 numbers a view, ASTRA's vectors, or the
                            name of a file beside this one (`lingo_mi.files.poses`). Poses in RTK's .xml reverse the rows of
                            the .npy, which run up in RTK's images
-    radius                 of a panel that is bent on a cylinder, mm: DSD where its axis passes through the focal spot.
+    radius                 of a panel that is bent on a cylinder, mm: DSD if its axis passes through the focal spot.
                            dDetector is then a pixel's height and width along the arc, offDetector's second number a shift along
                            the arc; poses say where the panel's middle is, and u and v there
     valid                  name of a .npy beside this one, bool [n, v, u] or [v, u]: pixels to use. Others may hold anything

@@ -123,7 +123,7 @@ def read_voxels(
 
 
 def _inflated(content: bytes, size: int) -> bytes:
-    """`size` bytes of zlib's. Raises EOFError where it ends before or behind them, or its checksum is missing."""
+    """`size` bytes of zlib's. Raises EOFError if it ends before or behind them, or its checksum is missing."""
     unpacker = zlib.decompressobj()
     out = unpacker.decompress(content, size)
     if unpacker.decompress(unpacker.unconsumed_tail, 1) or len(out) < size or not unpacker.eof:

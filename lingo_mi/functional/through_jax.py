@@ -18,7 +18,7 @@ from lingo_mi.projectors.upload import uploaded_tensor
 
 def call_jax(function: Callable[..., Any], arguments: Sequence[Argument], shape: tuple[int, ...]) -> Any:
     """A function of Dr.Jit's tensors, of JAX's arrays: float32 of that shape, differentiable in reverse mode."""
-    # Float64, which JAX has only where the caller has enabled it, stays that where it is computed on.
+    # Float64, which JAX has only if the caller has enabled it, stays float64 in the computation.
     arrays = [a.array if a.double and a.array.dtype == np.float64 else a.array.astype(jnp.float32) for a in arguments]
 
     def tensors_of(host):
@@ -47,7 +47,7 @@ def call_jax(function: Callable[..., Any], arguments: Sequence[Argument], shape:
 
 
 def _on_host(function, result, *arrays):
-    """function(*arrays) of NumPy's arrays; a callback where JAX traces, whose errors would hide ours elsewhere."""
+    """function(*arrays) of NumPy's arrays; a callback only while JAX traces, since its errors would hide ours."""
 
     def of_numpy(*arrays):
         with drjit_lock():

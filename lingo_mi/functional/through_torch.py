@@ -34,7 +34,7 @@ def call_torch(function: Callable[..., Any], arguments: Sequence[Argument], name
 
 
 class _OfDrJit(torch.autograd.Function):
-    """`drjit.wrap` would give the first derivatives again where PyTorch goes back through one graph twice."""
+    """`drjit.wrap` would give the first derivatives again if PyTorch goes back through one graph twice."""
 
     @staticmethod
     def forward(ctx: Any, function: Callable[..., Any], *arrays: torch.Tensor) -> torch.Tensor:
@@ -46,7 +46,7 @@ class _OfDrJit(torch.autograd.Function):
         result = function(*tensors)
         if any(wanted):
             ctx.graph = tensors, result
-            ctx.save_for_backward(*arrays)  # asked for, it raises where PyTorch has freed the graph
+            ctx.save_for_backward(*arrays)  # it raises if PyTorch has freed the graph
         return dr.detach(result).torch().clone()
 
     @staticmethod

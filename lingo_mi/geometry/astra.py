@@ -231,7 +231,7 @@ def grid(vol_geom: dict) -> Grid:
 
 
 def kind_of(proj_geom: dict) -> str:
-    """The type of a dict of ASTRA, empty where it has none.
+    """The type of a dict of ASTRA, empty if it has none.
 
     Raises
     ------

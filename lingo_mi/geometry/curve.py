@@ -75,7 +75,7 @@ class Curve:
         return self.columns(x, view), foot + (np.asarray(y, float) - foot) / self.share(x, view)
 
     def on_panel(self, x: ArrayLike, y: ArrayLike, view: int) -> tuple[np.ndarray, np.ndarray]:
-        """The inverse of `on_plane`, NaN where the ray does not meet the cylinder behind the source."""
+        """The inverse of `on_plane`, NaN if the ray does not meet the cylinder behind the source."""
         foot, distance = self.foot_u[view], self.distance[view]
         x, y = np.asarray(x, float), np.asarray(y, float)
         # In units of the distance, from the touching line: the source (p, 1), the flat panel (q, 0), the cylinder's axis (0, r).

@@ -71,7 +71,7 @@ def _sources(geometry: Geometry) -> np.ndarray:
 
 
 def _across(geometry: Geometry, view: int) -> np.ndarray:
-    """The horizontal direction across a view's panel, away from its source; x where the panel lies flat."""
+    """The horizontal direction across a view's panel, away from its source; x if the panel lies flat."""
     rays = geometry.rays(curved=True)
     normal = np.cross(rays.u[view], rays.v[view])
     normal *= np.sign(normal @ (_panel(geometry, view).mean(0) - _sources(geometry)[view]))

@@ -173,9 +173,9 @@ class Rays:
         return np.broadcast_to(self.source[view], point.shape), point - self.source[view]
 
     def project(self, points: ArrayLike, view: int) -> tuple[np.ndarray, np.ndarray]:
-        """Continuous pixel positions (x, y) of `points` [N, 3], NaN where a point is not in front of the source.
+        """Continuous pixel positions (x, y) of `points` [N, 3], NaN if a point is not in front of the source.
 
-        NaN also where the ray through a point passes a curved panel's cylinder.
+        NaN also if the ray through a point misses a curved panel's cylinder.
         """
         points = np.asarray(points, float)
         a, b, c = self.u[view], self.v[view], self.corner[view]

@@ -143,7 +143,7 @@ def write_rtk(path: PathLike | str, rays: Rays, nDetector: tuple[int, int]) -> N
     ------
     InputError
         If RTK cannot say it: panels whose rows and columns are not at right angles or differ between views, mirrored ones, panels
-        askew to a parallel beam; and where the file cannot be written.
+        askew to a parallel beam; and if the file cannot be written.
     """
     step_u, step_v = (np.linalg.norm(a, axis=1) for a in (rays.u, rays.v))
     radius = 0.0 if rays.curve is None else float(np.mean(rays.curve.radius * step_u))
@@ -198,7 +198,7 @@ def _facing_the_axis(rays: Rays, nDetector, radius) -> Rays:
 
 
 def _from_file(path) -> tuple[np.ndarray, float]:
-    """The columns of `_NUMBERS` of all views, [9, n], angles in radians, and the radius of the panel, 0 where it is flat."""
+    """The columns of `_NUMBERS` of all views, [9, n], angles in radians, and the radius of the panel, 0 if it is flat."""
     views = [[view[name] for name in (*_NUMBERS, RADIUS)] for view in _views(path)]
     *columns, radius = np.array(views, float).reshape(-1, len(_NUMBERS) + 1).T
     columns = np.array(columns)

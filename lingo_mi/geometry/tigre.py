@@ -53,7 +53,7 @@ def scan(geo: Any, angles: ArrayLike) -> Geometry:
         angles = angles[:, 0]  # what TIGRE makes of plain angles
 
     def each(name, length, default=None):
-        """[length], a number where that is 1, or the same for every view where they differ."""
+        """[length], a number if that is 1, or the same for every view if they differ."""
         value = default if value_of(name) is None else value_of(name)
         if value is None:
             raise InputError(f'the TIGRE geometry has no {name}')

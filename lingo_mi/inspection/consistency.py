@@ -46,7 +46,7 @@ def disagreement(plane: Plane, angles: np.ndarray, shift: float = 0.0) -> tuple[
     """Root mean square disagreement of all views, and of each view [n].
 
     Fan beam: relative differences of M over all pairs. Parallel beam: distances of the centres of mass from the best curve with
-    c = 0, over the half-width of the panel; nan where there are too few views.
+    c = 0, over the half-width of the panel; nan if there are too few views.
 
     Parameters
     ----------

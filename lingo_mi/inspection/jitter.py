@@ -9,7 +9,7 @@ STEEPEST = np.radians(6)  # between views: beyond, an outline's own motion is no
 
 
 def outline_jitter(p: np.ndarray, angles: np.ndarray) -> tuple[float, float]:
-    """Standard deviation in pixels of the outline's place, (along columns, along rows); nan where it cannot be told.
+    """Standard deviation in pixels of the outline's place, (along columns, along rows); nan if it cannot be determined.
 
     The place along a row is the mean of the object's left and right edge, and that along a column the mean of its upper and
     lower one. For independent errors of deviation s the third differences of neighbouring views have the deviation s sqrt(20).

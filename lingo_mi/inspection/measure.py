@@ -326,7 +326,7 @@ def _border(p, valid, high):
 
 
 def _outer(p):
-    """Medians of `BLOCK` pixels at the left and right edge of the views, [view, row, side], NaN where none is known."""
+    """Medians of `BLOCK` pixels at the left and right edge of the views, [view, row, side], NaN if none is valid."""
     long, deep = (min(size, have) for size, have in zip(BLOCK, p.shape[1:]))
     edges = np.stack([p[:, :, :deep], p[:, :, -deep:]], 2)[:, : p.shape[1] // long * long]
     blocks = edges.reshape(len(p), -1, long, 2, deep).swapaxes(2, 3).reshape(len(p), -1, 2, long * deep)

@@ -11,7 +11,7 @@ Each measure comes in two forms. The plain name is the absolute one, and `_r2` i
 Published tables hold R2-Gaussian's forms.
 
 Every function takes the result first and the truth second, raises InputError if the shapes differ or a
-value is not finite, and returns a float: inf dB for identical images, NaN where the truth holds nothing to
+value is not finite, and returns a float: inf dB for identical images, NaN if the truth holds nothing to
 compare with.
 
 References: Zha et al., "R2-Gaussian", NeurIPS 2024 (its forms); Wang et al., "Image quality assessment:
@@ -95,7 +95,7 @@ def psnr_3d_r2(volume: ArrayLike, truth: ArrayLike) -> float:
     Parameters
     ----------
     volume, truth : array_like [x, y, z]
-        The number means what it says where the truth's densities fill [0, 1].
+        The number is meaningful if the truth's densities fill [0, 1].
     """
     return _psnr(*_pair(volume, truth, 'volumes', '[x, y, z]'), 1.0)
 

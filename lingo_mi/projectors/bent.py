@@ -99,7 +99,7 @@ class Bend:
         return Bend(uploaded(table, double=True), uploaded(np.append(curve.numbers, largest), double=True))
 
     def column(self, u: Any, active: Any = True) -> tuple[Any, Any]:
-        """X and s of columns u, Float64; 0 and 1 where they are not active."""
+        """X and s of columns u, Float64; 0 and 1 if they are not active."""
         scale = dr.gather(mi.Float64, self.table, 2 * u + 1, active)
         return dr.gather(mi.Float64, self.table, 2 * u, active), dr.select(active, scale, 1)
 

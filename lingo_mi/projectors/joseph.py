@@ -94,7 +94,7 @@ def _is_upright(geometry: Geometry) -> bool:
 
 
 def _rows_of_voxel(geometry):
-    """The largest number of rows with hats that cover a voxel; infinity where a voxel lies beside the source or behind it.
+    """The largest number of rows with hats that cover a voxel; infinity if a voxel lies beside the source or behind it.
 
     A curved panel stands before the flat one that it touches, where its rows are not further apart in voxels.
     """

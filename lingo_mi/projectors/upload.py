@@ -31,6 +31,6 @@ def uploaded(values: np.ndarray, double: bool = False) -> Any:
 
 
 def uploaded_tensor(values: ArrayLike, double: bool = False) -> Any:
-    """A copy of NumPy's values of any shape: TensorXf, or TensorXd where they are to be double."""
+    """A copy of NumPy's values of any shape: TensorXf, or TensorXd if they are to be double."""
     tensor: Any = mi.TensorXd if double else mi.TensorXf
     return tensor(uploaded(np.asarray(values), double), np.shape(values))

@@ -69,7 +69,7 @@ def require_unfrozen(what: str) -> None:
     """Raises InputError within a function under `dr.freeze`.
 
     A projection shares its work out by counts that it reads back from the device, and these change with the cloud: a recording
-    cannot be replayed, and Dr.Jit ends the process where one is tried.
+    cannot be replayed, and Dr.Jit ends the process if one is tried.
 
     Parameters
     ----------

@@ -81,7 +81,7 @@ class Beam:
         return cls(panel, i0, air, options.percentile, limit)
 
     def level(self, frame: np.ndarray, exposure: float) -> float:
-        """The air level of a whole frame, over what the panel shows at this exposure; 1 where the beam is known otherwise, and
+        """The air level of a whole frame, over what the panel shows at this exposure; 1 if the beam is known otherwise, and
         NaN without a good pixel."""
         if self.air is None and self.percentile is None:
             return 1.0

@@ -44,7 +44,7 @@ def import_raw(
     ------
     InputError
         If something is missing, contradictory or damaged; warns of views that are black, saturated or brighter than the flat
-        field, and where most pixels are left out.
+        field, and if most pixels are left out.
     """
     recording = open_recording(path)
     if recording.transmission and (options.flats is not None or options.darks is not None):

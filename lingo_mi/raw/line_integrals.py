@@ -198,6 +198,6 @@ def photons_of_images(projections: np.ndarray, valid: np.ndarray | None = None) 
     scaled = np.abs(difference) / np.sqrt(power)
     if valid is not None:
         scaled = scaled[np.logical_and.reduce([valid[some][..., part] for _, part in parts])]
-    scaled = scaled[scaled > 0]  # where all are exactly alike there was nothing to count
+    scaled = scaled[scaled > 0]  # if all are exactly alike, there was nothing to count
     sigma = 1.4826 * np.median(scaled) if scaled.size else 0.0
     return float(1 / sigma**2) if sigma > 0 else np.inf

@@ -71,7 +71,7 @@ def read_numbers(path: PathLike | str) -> np.ndarray:
             values += [float(cell) for cell in cells][-1:]
         except ValueError:
             if _is_number(cells[0]):
-                raise InputError(f'{path}: line {number} has {shown(cells[1])} where a number must be') from None
+                raise InputError(f'{path}: line {number} has {shown(cells[1])} instead of a number') from None
     if not values or not np.isfinite(values).all():
         raise InputError(f'{path}: holds no numbers; write one a line')
     return np.array(values)

@@ -23,7 +23,7 @@ from lingo_mi.storage.file_access import reading
 
 
 def read_nsipro(path: PathLike | str) -> Taken:
-    """The scan that a .nsipro describes: a circle, or poses where the panel is turned.
+    """The scan that a .nsipro describes: a circle, or poses if the panel is turned.
 
     Raises
     ------

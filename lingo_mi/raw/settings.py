@@ -44,7 +44,7 @@ class Settings:
         return cls(path, kind, parser)
 
     def text(self, section: str, name: str) -> str:
-        """A value, empty where it is missing."""
+        """A value, empty if it is missing."""
         return (self.values.get(section, name, fallback='') or '').strip()
 
     def number(self, section: str, name: str, default: float | None = None) -> float:

@@ -36,7 +36,7 @@ class Reconstruction:
     volume : float32 [x, y, z]
         Density per mm.
     residuals : list[float]
-        |A x - b| / |b| at the start and after every iteration (b = 0: |A x|), NaN where it was not computed; none for FDK.
+        |A x - b| / |b| at the start and after every iteration (b = 0: |A x|), NaN if it was not computed; none for FDK.
     seconds : float
         Wall-clock time.
     grid : Grid

@@ -338,7 +338,7 @@ class FDK(Algorithm):
 
 
 def _slab_memory(scan: Scan, thickness: int) -> float:
-    """Peak memory of `FDK.slabs`, bytes: three slabs, the scan, its upright panel where that is another, all filtered views."""
+    """Peak memory of `FDK.slabs`, bytes: three slabs, the scan, its upright panel if that is another, all filtered views."""
     level = rectified_geometry(scan.geometry, NAME)
     pixels = 0 if level is scan.geometry else prod(level.nDetector)
     pixels += prod(scan.geometry.nDetector) + prod(extended(level)[0].nDetector)

@@ -36,7 +36,7 @@ NEEDS = {  # by the algorithms' names
 
 def memory_needed(algorithm: str, geometry: Geometry, views: int) -> float:
     """Peak memory of an algorithm of `NEEDS`, bytes: the larger of two peaks, of work on volumes (plus at most two sets of
-    projections) and of work on projections (plus one volume). FDK has another set on the upright panel where the real one
+    projections) and of work on projections (plus one volume). FDK has another set on the upright panel if the real one
     leans."""
     volume, projections = 4 * prod(geometry.grid.shape), 4 * views * prod(geometry.nDetector)
     need = NEEDS[algorithm]

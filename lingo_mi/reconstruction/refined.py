@@ -131,7 +131,7 @@ class Refined(Algorithm):
         began = time.perf_counter()
         geometry, steps = scan.geometry, self.steps(scan)
         if self.completed_niter and completed is None:
-            raise InputError('completed_niter must be 0 where no completed views are given')
+            raise InputError('completed_niter must be 0 if no completed views are given')
         fine = self.grid(geometry)
         if sample is not None and start is None:
             volume = sample(fine)

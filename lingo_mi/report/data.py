@@ -34,7 +34,7 @@ class ReportData:
     shape           its voxels, (x, y, z); by default those of `volume`
     spacing         voxel size, (x, y, z), mm
     truth           the true volume, as `volume`; None for measured data
-    preview         n, where each voxel of `volume` and `truth` is the mean of n^3 of the grid that `shape` and `spacing` describe
+    preview         n, if each voxel of `volume` and `truth` is the mean of n^3 of the grid that `shape` and `spacing` describe
     error_map       how far off the volume may be, 1/mm (`reconstruction.best.error_map`), not negative, as `volume`; or None
     centre          of the volume, (x, y, z), mm
     views           [n, v, u] rendered held-out views: line integrals ln(I0/I)

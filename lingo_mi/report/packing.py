@@ -44,7 +44,7 @@ class Arrays(dict[str, Packed]):
         )
 
     def scale(self, name: str, low: float, high: float) -> tuple[float, float]:
-        """The range to pack an array with: [low, high], or the one of before where that holds it and is not too wide."""
+        """The range to pack an array with: [low, high], or the earlier one if that holds it and is not too wide."""
         if name not in self._earlier:
             return low, high
         least, most = self._earlier[name][0][1:3]
@@ -87,7 +87,7 @@ def bits_within(arrays: Sequence[np.ndarray], low: float, high: float, budget: f
 
 
 def preview(volume: np.ndarray, most: int = MOST_VOXELS) -> tuple[np.ndarray, int]:
-    """The volume, or means of n^3 voxels where it has more than `most`; and n."""
+    """The volume, or means of n^3 voxels if it has more than `most`; and n."""
     n = 1
     while volume.size / n**3 > most:
         n += 1

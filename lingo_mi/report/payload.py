@@ -82,7 +82,7 @@ def slice_payload(
     of: tuple | None = None,
     quantity: str = REAL,
 ) -> dict:
-    """Volumes [x, y, z] on one grid, with one scale, as previews where they would take more than `budget` bytes.
+    """Volumes [x, y, z] on one grid, with one scale, as previews if they would take more than `budget` bytes.
 
     Parameters
     ----------
@@ -148,7 +148,7 @@ def view_payload(
     reference: str | None = None,
     budget: float = VIEW_BYTES,
 ) -> dict:
-    """Held-out views [n, v, u], in the order of their angles; fewer and smaller ones where they are many and large.
+    """Held-out views [n, v, u], in the order of their angles; fewer and smaller ones if they are many and large.
 
     Parameters
     ----------

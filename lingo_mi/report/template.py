@@ -59,7 +59,7 @@ def as_json(value: object) -> str:
 
 
 def html_table(title: str, rows: list[tuple[str, ...]], kind: str = '', head: tuple[str, ...] = ()) -> str:
-    """A section with a table: of each row the name, the values, and what it means where `kind` is 'numbers'."""
+    """A section with a table: of each row the name, the values, and what it means if `kind` is 'numbers'."""
     out = [f'<section><h2>{html.escape(title)}</h2><div class="scroll"><table class="{kind}">']
     if head:
         out.append('<thead><tr>' + ''.join(f'<th scope="col">{html.escape(h)}</th>' for h in head) + '</tr></thead>')

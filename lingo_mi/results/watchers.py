@@ -12,7 +12,7 @@ from lingo_mi.results.watch import Watcher
 
 
 def watchers_of(geometry: Geometry, live: bool, log_dir: str | PathLike | None, title: str) -> list[Watcher]:
-    """A live page, whose address is said, and a log of events, each where it is asked for.
+    """A live page, whose address is printed, and a log of events, each if it is asked for.
 
     Raises
     ------

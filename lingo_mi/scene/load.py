@@ -43,7 +43,7 @@ def load_scene(path: PathLike | str, parameters: dict | None = None, slab: int =
     Raises
     ------
     InputError
-        In one line, for whatever mitsuba or a plugin finds wrong, and where memory does not suffice.
+        In one line, for whatever mitsuba or a plugin finds wrong, and if memory does not suffice.
     """
     path = Path(path)
     accepted = outline(path, parameters)

@@ -1,4 +1,4 @@
-"""A look at a scene file before Mitsuba reads it, whose parser ends the process where elements are nested too deep.
+"""Read a scene file before Mitsuba does, whose parser ends the process if elements are nested too deep.
 
 Files that it includes are looked at too. `expat` reads element by element and keeps nothing.
 """

@@ -84,7 +84,7 @@ def take_scan(
     if truth and true is None:
         warnings.warn(
             f'{loaded.path}: the volume is not compared with the true one, since the scanner has other voxels (nVoxel, dVoxel) '
-            'than the object, or the object is in a shapegroup; give both the same, where the scene lets you',
+            'than the object, or the object is in a shapegroup; give both the same, if the scene lets you',
             stacklevel=2,
         )
     return choose_views(Dataset(train, held_out, true), 0 if test is not None else views)

@@ -335,7 +335,7 @@ def beside(file: PathLike | str, name: Any) -> Path:
 
 
 def as_path(name: str, value: Any) -> Path:
-    """`value` as a path. Raises InputError, in the name of `name`, where it is none."""
+    """`value` as a path. Raises InputError, in the name of `name`, if it is not a path."""
     try:
         return Path(value)
     except TypeError:

@@ -1,6 +1,6 @@
 """One writer at a time: a lock file that names its owner, and that a killed process does not leave locked.
 
-filelock names no owner, takes a user's file of that name for its lock, and fails where the system answers that it does not
+filelock names no owner, takes a user's file of that name for its lock, and fails if the system answers that it does not
 support locks.
 """
 

@@ -217,7 +217,7 @@ def _walk(scene, o, d, gaussians, epsilon, upstream, backward):
 
 
 def _closed_form(o, d, gaussians, index, active):
-    """The line integral through Gaussian `index` of (data, density); 0 where not active. d is of length 1."""
+    """The line integral through Gaussian `index` of (data, density); 0 if not active. d is of length 1."""
     data, density = gaussians
     c = [dr.gather(mi.Float, data, index * 10 + j, active) for j in range(10)]
     rows = rows_of(dr.select(active, mi.Vector4f(*c[6:]), mi.Vector4f(0, 0, 0, 1)), mi.Vector3f)

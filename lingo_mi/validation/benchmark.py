@@ -197,7 +197,7 @@ class Bench:
 
 
 def _timed(function, *arguments):
-    """What a function gives, and the milliseconds that it takes."""
+    """The result of a function, and the milliseconds that it takes."""
     begun = time.perf_counter()
     out = function(*arguments)
     dr.sync_thread()

@@ -99,7 +99,7 @@ def test_files_of_a_stranger_are_left_alone(home, name):
     (home / 'out').mkdir()
     (home / 'out' / name).write_text('mine')
     code, _, err = batch(home)
-    assert code == 2 and f'{name}: is not that of a batch' in err and err.count('\n') == 1
+    assert code == 2 and f'{name}: does not belong to a batch' in err and err.count('\n') == 1
     assert (home / 'out' / name).read_text() == 'mine' and len([*(home / 'out').iterdir()]) <= 2
 
 
@@ -229,7 +229,7 @@ def test_lists_that_spreadsheets_write(home, content):
     (b'', 'is empty'), (b'\xef\xbb\xbf\n \n', 'is empty'), (b'file\n', 'no scan below'), (b'name,views\na,3\n', 'no column file'),
     (b'file,file\na,b\n', "2 columns 'file'"), (b'file,,views\na,b,3\n', 'column 2 has no name'),
     ('file\nä\n'.encode('latin-1'), 'line 2: is not UTF-8'), ('file\na\n'.encode('utf-16'), 'UTF-16'),
-    (b'file\n"a\n', 'no CSV'), (b'file\na\0b\n', ''), (b'\x00\x01\x02', ''),
+    (b'file\n"a\n', 'not CSV'), (b'file\na\0b\n', ''), (b'\x00\x01\x02', ''),
 ])  # fmt: skip
 @pytest.mark.posix
 def test_files_that_are_no_list(home, content, message):

@@ -92,7 +92,7 @@ def test_angles(tmp_path):
     path.write_text('1 0.5 10:30:00\n2 1.5 late\n')
     assert read_numbers(path).tolist() == [0.5, 1.5]
     path.write_text('1 0.5\n2 lost\n')
-    with pytest.raises(lm.InputError, match="line 2 has 'lost' where a number must be"):
+    with pytest.raises(lm.InputError, match="line 2 has 'lost' instead of a number"):
         read_numbers(path)
     path.write_text('1,0\n2,90\n3,180\n')
     assert read_numbers(path).tolist() == [0, 90, 180]

@@ -153,7 +153,7 @@ def test_what_a_run_needs(scan):
     volume = np.ones(scan.geometry.grid.shape)
     with pytest.raises(InputError, match='leave out start'):
         run_algorithm(scan, FDK(), start=volume)
-    with pytest.raises(InputError, match='completed_niter must be 0 where no completed views are given'):
+    with pytest.raises(InputError, match='completed_niter must be 0 if no completed views are given'):
         run_algorithm(scan, Refined(), start=volume)
     refined = quick('refined')
     for given in ({}, dict(start=volume, sample=lambda _: volume)):

@@ -72,7 +72,7 @@ def _random_field() -> DeviceState:
 def _image(
     options: Field, geometry: Geometry, state: DeviceState, rng: np.random.Generator | None = None
 ) -> np.ndarray:
-    """One view, ray by ray; with random samples where `rng` is given."""
+    """One view, ray by ray; with random samples if `rng` is given."""
     model = FieldModel(options, geometry, 1.0)
     if rng is None:
         return model.render(state, geometry)[0].ravel()

@@ -83,7 +83,7 @@ class Scale:
     objects : tuple[str, ...]
         If the user names none.
     finer : int
-        How many times as many voxels are scanned along each side, where the object has them: the projections then hold structure
+        How many times as many voxels are scanned along each side, if the object has them: the projections then hold structure
         that the reconstructed voxels cannot.
     photons : float
         A pixel in the open beam, by which the views to fit are measured; 0: without noise.
@@ -167,7 +167,7 @@ class Volume:
 
 
 def method_for(fit: Fit, scale: Scale) -> Method:
-    """The method of a fit, with the scale's number of Gaussians and voxel scaling where the fit does not name them."""
+    """The method of a fit, with the scale's number of Gaussians and voxel scaling if the fit does not name them."""
     method = method_of(fit.method)
     if 'n_points' in method.flat() and 'n_points=' not in fit.method:
         method = method.changed(n_points=scale.n_points)

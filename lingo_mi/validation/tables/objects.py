@@ -31,7 +31,7 @@ def available(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
     Raises
     ------
     InputError
-        For a name that is neither, and where no object is left.
+        For a name that is neither, and if no object is left.
     """
     objects = []
     for name in names:
