@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from scipy import ndimage
@@ -14,6 +16,8 @@ from lingo_mi.common.arrays import as_numpy, short_repr
 from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.geometry import CurvedGeometry, Geometry, Grid
 from lingo_mi.geometry.rays import Index, checked_views
+
+PIECE = 16  # views that are read together where all are gone through
 
 
 class PixelEffects(Protocol):
@@ -28,6 +32,23 @@ class PixelEffects(Protocol):
         ...
 
 
+class StoredViews(ABC):
+    """Projections that lie in a file, which is read where they are needed; `files.zarr_views` reads them."""
+
+    shape: tuple[int, int, int]  # of the projections [view, v, u]
+
+    @abstractmethod
+    def __getitem__(self, index: Index) -> np.ndarray:
+        """Line integrals of some views, float32 [view, v, u], finite."""
+
+    @abstractmethod
+    def subset(self, index: Index) -> StoredViews:
+        """Some of the views, which are not read."""
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        return self[:].astype(dtype or np.float32, copy=False)
+
+
 @dataclass(frozen=True, eq=False)
 class Scan:
     """Measured or simulated projections.
@@ -39,7 +60,8 @@ class Scan:
     geometry : Geometry
         In mm.
     projections : float32 [view, v, u]
-        Line integrals ln(I0 / I), density times mm.
+        Line integrals ln(I0 / I), density times mm. Of `StoredViews`, `views` reads those that are asked for, and `projections`
+        reads all and keeps them.
     valid : ndarray or None
         Bool [view, v, u], where pixels must be left out (dead ones, metal, a collimator's shadow); None: all are valid. What the
         projections hold in the others, NaN included, is forgotten: they become 0.
@@ -62,8 +84,23 @@ class Scan:
     projections: np.ndarray
     valid: np.ndarray | None = None
 
-    __repr__ = short_repr
     effects: PixelEffects | None = None
+    stored: StoredViews | None = field(default=None, init=False)
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name):  # of what is missing: the projections of stored views, before they are read
+            if name != 'projections' or self.__dict__.get('stored') is None:
+                raise AttributeError(f'{type(self).__name__!r} object has no attribute {name!r}')
+            object.__setattr__(self, 'projections', self.stored[:])
+            return self.projections
+
+    def __repr__(self) -> str:
+        return (
+            short_repr(self)
+            if self.stored is None
+            else f'Scan(geometry={self.geometry!r}, projections={self.stored!r})'
+        )
 
     def _repr_html_(self) -> str:
         """For a notebook: the projections with a slider, and the scanner."""
@@ -82,12 +119,20 @@ class Scan:
             raise InputError(
                 'effects of a detector are modelled on flat panels alone: give line integrals without effects'
             )
-        p = as_numpy(self.projections, 'the projections', np.float32)
         expected = (len(self.geometry), *self.geometry.nDetector)
+        given: Any = self.projections
+        if isinstance(given, StoredViews) and self.valid is None and self.effects is None:
+            object.__setattr__(self, 'stored', given)
+            object.__delattr__(self, 'projections')
+            p = given
+        else:
+            p = as_numpy(given, 'the projections', np.float32)
         if p.shape != expected:
             raise InputError(
                 f'the projections have the shape {p.shape}, but the geometry says [view, v, u] = {expected}'
             )
+        if isinstance(p, StoredViews):
+            return
         if self.valid is not None:
             valid = as_numpy(self.valid, 'the mask of valid pixels')
             if valid.shape != expected or valid.dtype != bool:
@@ -115,12 +160,23 @@ class Scan:
             For views that the scan does not have.
         """
         index = checked_views(index, len(self))
+        if self.stored is not None:
+            return Scan(self.geometry.subset(index), self.stored.subset(index))  # type: ignore[arg-type] - read when needed
         return replace(
             self,
             geometry=self.geometry.subset(index),
             projections=self.projections[index],
             valid=None if self.valid is None else self.valid[index],
         )
+
+    def views(self, index: Index) -> np.ndarray:
+        """The projections of some views, float32 [view, v, u]; of stored ones, these alone are read."""
+        return self.projections[index] if self.stored is None else self.stored[index]
+
+    def pieces(self) -> Iterator[np.ndarray]:
+        """All projections, `PIECE` views after the other."""
+        for first in range(0, len(self), PIECE):
+            yield self.views(slice(first, first + PIECE))
 
     def binned(self, factor: int) -> Scan:
         """The same views with `factor` x `factor` pixels averaged into one; rows and columns left over are dropped.
@@ -141,6 +197,8 @@ class Scan:
 
     def on(self, grid: Grid) -> Scan:
         """The same scan with other voxels."""
+        if self.stored is not None:
+            return Scan(self.geometry.on(grid), self.stored)  # type: ignore[arg-type] - read when needed
         return replace(self, geometry=self.geometry.on(grid))
 
     def to_flat(self) -> Scan:
@@ -178,7 +236,7 @@ class Scan:
         numbers = geometry.grid.shape, geometry.grid.spacing, geometry.grid.centre, geometry.nDetector
         hasher = hashlib.blake2b(repr(numbers).encode(), digest_size=16)
         bend = None if rays.curve is None else rays.curve.numbers
-        for array in (rays.source, rays.corner, rays.u, rays.v, bend, self.projections, self.valid):
+        for array in (rays.source, rays.corner, rays.u, rays.v, bend, *self.pieces(), self.valid):
             hasher.update(b'' if array is None else np.ascontiguousarray(array).data)
         return hasher.hexdigest()
 

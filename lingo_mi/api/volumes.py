@@ -23,11 +23,10 @@ from lingo_mi.files.units import PER_MM, Unit, unit_of
 from lingo_mi.fitting.fit import Fit
 from lingo_mi.inspection.measure import warn_of_intensities
 from lingo_mi.jobs.cluster import workers
-from lingo_mi.reconstruction import FDK, Algorithm, Best, Reconstruction, Refined
+from lingo_mi.reconstruction import Algorithm, Best, Reconstruction, Refined
 from lingo_mi.reconstruction.line_integrals import line_integrals
 from lingo_mi.reconstruction.preconditions import require_rays, require_signal
-from lingo_mi.reconstruction.run import check_room, mask_images, progress_bar, run_algorithm, run_in_slabs
-from lingo_mi.reconstruction.sart import Sweeps
+from lingo_mi.reconstruction.run import InSlabs, check_room, mask_images, progress_bar, run_algorithm, run_in_slabs
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.storage.file_access import as_path, check_new_file, writing
 from lingo_mi.storage.folder_lock import writing_file
@@ -103,9 +102,9 @@ def reconstruct(
     units, mu_water
         Units of the values in that file: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm (`Reconstruction.save`).
     slab : int, optional
-        Slices of a slab. `FDK`, `SART`, `OSSART` and `SIRT` then make the volume slab by slab and write each to `out`, so the
-        volume need not fit into memory. Iterative ones store the volume in a folder beside `out`, whose name ends in .slabs,
-        while they work. If they are stopped, the same call continues.
+        Slices of a slab. `FDK`, `SART`, `OSSART`, `SIRT` and `ASDPOCS` then make the volume slab by slab and write each to `out`,
+        so the volume need not fit into memory. Iterative ones store the volume in a folder beside `out`, whose name ends in
+        .slabs, while they work. If they are stopped, the same call continues.
     cluster : str or Client, optional
         A Dask cluster whose workers make the slabs (default: of 64 slices) and write them to `out`, an .ome.zarr: the scheduler's
         address or file, 'local:N' for N processes of this machine, or a client of `distributed`. Workers must see the folder of
@@ -161,7 +160,7 @@ def reconstruct(
     with nullcontext() if path is None else writing_file(path):
         scan, algorithm, inputs = _prepared(scan, algorithm, start, views)
         if path is not None and slab is not None:
-            assert isinstance(algorithm, FDK | Sweeps)  # see `_check`
+            assert isinstance(algorithm, InSlabs)  # see `_check`
             with (
                 nullcontext() if cluster is None else workers(cluster, path) as runner,
                 progress_bar(algorithm, scan, steps=algorithm.slab_steps(scan, slab), shown=progress) as bar,
@@ -197,9 +196,9 @@ def _check(algorithm: Any, start: Fit | np.ndarray | None, views: int | None, pa
         return
     if path is None:
         raise InputError('slab=N writes the volume while it is made: give out=FILE')
-    if not isinstance(algorithm, FDK | Sweeps):
+    if not isinstance(algorithm, InSlabs):
         raise InputError(
-            f'slab=N is for fdk, sart, os-sart and sirt; {algorithm.name} needs the whole volume: leave it out'
+            f'slab=N is for fdk, sart, os-sart, sirt and asd-pocs; {algorithm.name} needs the whole volume: leave it out'
         )
     if start is not None and views is None:
         raise InputError('slab=N starts from an empty volume: leave out start, or slab')

@@ -260,7 +260,8 @@ def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: in
 
     if args.projections:
         dataset = choose_views(with_effects(read_scan(args.projections), scene), views or 0)
-        check_memory(thinned(dataset.train.geometry, slab))
+        in_file = slab and dataset.train.stored is not None  # then only some views are in memory
+        check_memory(thinned(dataset.train.geometry, slab), views=1 if in_file else 0)
         warn_if_truncated(dataset.train.geometry)
         return dataset
     volume = None

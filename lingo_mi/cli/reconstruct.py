@@ -22,9 +22,10 @@ where the volume is least certain, and is a layer of the page that --report writ
 Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is given;
 with --complete and --start, those that the fit has modelled.
 
-A volume larger than memory is made and written in slabs of --slab slices, by fdk, sart, os-sart, sirt and voxelize. The iterative
-ones hold it in a folder beside it, with the name of the volume and .slabs, until it is written. If they are stopped, the
-same command goes on. With --cluster, workers make the slabs and write them to an .ome.zarr; they must see its folder.
+A volume larger than memory is made and written in slabs of --slab slices, by fdk, sart, os-sart, sirt, asd-pocs and voxelize. The
+iterative ones hold it in a folder beside it, with the name of the volume and .slabs, until it is written. If they are
+stopped, the same command goes on. With --cluster, workers make the slabs and write them to an .ome.zarr; they must see its
+folder.
 """
 
 import argparse
@@ -67,7 +68,7 @@ from lingo_mi.scene.shipped import scene_path
 from lingo_mi.storage.file_access import check_new_file, require_writable
 from lingo_mi.storage.folder_lock import writing_file
 
-IN_SLABS = 'fdk', 'sart', 'os-sart', 'sirt', 'voxelize'  # those that need not hold the whole volume
+IN_SLABS = 'fdk', 'sart', 'os-sart', 'sirt', 'asd-pocs', 'voxelize'  # those that need not hold the whole volume
 
 
 def parser() -> Parser:

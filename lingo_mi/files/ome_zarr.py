@@ -51,7 +51,7 @@ def read_ome_zarr(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
     if not set(SPACE) <= set(names) or len(set(names)) != len(names):
         fail(f'has the axes {" ".join(names)}; a volume with the axes z, y and x is needed')
     with reading(folder, folder=True):
-        version = _require_codecs(path, folder)
+        version = require_codecs(path, folder)
         try:
             array: Any = zarr.open_array(str(folder), mode='r', zarr_format=version)
             shape, dtype = tuple(int(n) for n in array.shape), np.dtype(array.dtype)
@@ -126,8 +126,14 @@ def _placed(transformations, dimensions):
     return steps, shift
 
 
-def _require_codecs(path, folder):
-    """The version of Zarr. Raises InputError for a codec that is not of CODECS."""
+def require_codecs(path: Path, folder: Path) -> int:
+    """The version of Zarr of the array in `folder`.
+
+    Raises
+    ------
+    InputError
+        In the name of `path`, for a codec that is not of CODECS.
+    """
     if (folder / 'zarr.json').is_file():
         version, used = 3, _names(_json(path, folder / 'zarr.json').get('codecs'))
     elif (folder / '.zarray').is_file():

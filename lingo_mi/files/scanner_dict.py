@@ -14,7 +14,7 @@ from lingo_mi.geometry import CircularGeometry, CurvedGeometry, Geometry
 from lingo_mi.geometry.grid import Grid, grid_of
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.geometry.trajectories import helix
-from lingo_mi.scan import Dataset, Scan
+from lingo_mi.scan import Dataset, Scan, StoredViews
 
 # Names that move the scanner off its circle.
 MOTION = ('rotDetector', 'COR', 'tilt', 'pitch', 'z')
@@ -287,11 +287,11 @@ def angle_range(angles: np.ndarray) -> tuple[float, float]:
 
 
 def make_scan(
-    geometry: Geometry, projections: np.ndarray, where: PathLike | str, valid: np.ndarray | None = None
+    geometry: Geometry, projections: np.ndarray | StoredViews, where: PathLike | str, valid: np.ndarray | None = None
 ) -> Scan:
     """A Scan whose InputError names the file."""
     try:
-        return Scan(geometry, projections, valid)
+        return Scan(geometry, projections, valid)  # type: ignore[arg-type] - stored views are read when needed
     except InputError as error:
         raise InputError(f'{where}: {error}') from None
 

@@ -35,6 +35,9 @@ value for every view; an angle may be three, TIGRE's Euler angles.
 Any other name is refused, so that a misspelt or unsupported one is noticed. TIGRE's accuracy and filter do not
 describe the scanner and are ignored.
 
+Projections in chunks: `scan.zarr`, a Zarr array [n, v, u], and `scan.yml` as above. What works on slabs reads the views
+that it needs; all else reads them all.
+
 A folder of EXR images: `geometry.yml` as above (with `test_angles` or `test_poses` if there are held-out views),
 `train/0000.exr` …, `test/0000.exr` …, each one view, and `volume.nii.gz` if the true volume is known.
 
@@ -72,6 +75,7 @@ from lingo_mi.files.scanner_dict import (
 )
 from lingo_mi.files.slices import by_number
 from lingo_mi.files.volumes import read_volume, write_volume
+from lingo_mi.files.zarr_views import write_zarr_views, zarr_views
 from lingo_mi.geometry import CircularGeometry, CurvedGeometry, Geometry, astra
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.scan import Dataset, Scan
@@ -111,6 +115,7 @@ FRAMES = {  # raw ones
     *('.tif', '.tiff', '.edf', '.png', '.jp2', '.j2k', '.jpx', '.his', '.hnd', '.hnc', '.xim'),
     *('.h5', '.hdf5', '.hdf', '.nxs', '.nx', '.dcm', '.ima', '.txrm', '.xrm'),
 }
+ARRAYS = '.npy', '.zarr'  # projections with a geometry file
 VALID, POSES = '.valid.npy', '.poses.npy'  # endings of the files beside an .npy
 
 
@@ -286,13 +291,32 @@ def rows_run_up(values: dict, name: str = 'poses') -> bool:
     return str(values.get(name)).lower().endswith('.xml')
 
 
-def _read_npy(path, geometry):
+def _values_of_one_scan(geometry):
+    """The names of a geometry file that goes with one array."""
     values = load_yaml(geometry)
     for name in ('test_angles', 'test_poses'):
         if values.get(name) is not None:
             raise InputError(
-                f'{geometry}: {name} goes with a folder of EXR views; an .npy holds the views to fit alone'
+                f'{geometry}: {name} goes with a folder of EXR views; an array holds the views to fit alone'
             )
+    return values
+
+
+def _read_zarr(path, geometry):
+    values = _values_of_one_scan(geometry)
+    if values.get('input', 'line_integral') != 'line_integral':
+        raise InputError(
+            f'{geometry}: projections in a .zarr are line integrals: leave out input, and take the logarithm'
+        )
+    views = zarr_views(path, rows_run_up(values))
+    valid = _valid(values, views.shape, geometry)
+    if valid is not None:
+        valid = valid[:, ::-1] if views.rows_run_up else valid
+    return Dataset(make_scan(posed_geometry(values, len(views.numbers), geometry), views, path, valid))
+
+
+def _read_npy(path, geometry):
+    values = _values_of_one_scan(geometry)
     projections = arrays.read_npy(path, 3, finite=values.get('valid') is None)
     valid = _valid(values, projections.shape, geometry)
     if valid is not None:
@@ -319,6 +343,17 @@ def named_files(geometry: PathLike | str) -> list[Path]:
     values = load_yaml(geometry)
     names = (values.get(key) for key in ('poses', 'test_poses', 'valid'))
     return [beside(geometry, name) for name in names if isinstance(name, str)]
+
+
+def _write_zarr(path, dataset):
+    path, scan = Path(path), dataset.train
+    if path.suffix != '.zarr':
+        raise InputError(f'{path}: give projections in chunks a name that ends in .zarr')
+    if dataset.test is not None or dataset.volume is not None:
+        raise InputError(f'{path}: a .zarr holds the training views alone; drop the test views and the volume')
+    with replacing(path.with_suffix('.yml')) as file:
+        _dump_yaml(file, scan.geometry)
+        write_zarr_views(path, scan.projections)
 
 
 def _write_npy(path, dataset, history=None):
@@ -419,10 +454,10 @@ def read_scan(path: PathLike | str, geometry: PathLike | str | None = None, name
     Parameters
     ----------
     path : path-like
-        .pickle, .pkl: NAF / SAX-NeRF (X3D); .npy: projections with a geometry file; .npz: a public scan (`public_scans`); a
-        folder with meta_data.json (R2-Gaussian) or with geometry.yml (EXR views).
+        .pickle, .pkl: NAF / SAX-NeRF (X3D); .npy, or a folder .zarr: projections with a geometry file; .npz: a public scan
+        (`public_scans`); a folder with meta_data.json (R2-Gaussian) or with geometry.yml (EXR views).
     geometry : path-like or None
-        The geometry file of an .npy; without it, the .yml or .yaml of the same stem.
+        The geometry file of an .npy or .zarr; without it, the .yml or .yaml of the same stem.
     name : str
         Which sinogram of the Helsinki Tomography Challenge.
 
@@ -450,8 +485,12 @@ def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if geometry is not None and suffix != '.npy':
-        raise InputError(f'{path}: carries its own geometry; a geometry file goes with .npy projections only')
+    if geometry is not None and suffix not in ARRAYS:
+        raise InputError(
+            f'{path}: carries its own geometry; a geometry file goes with projections in .npy or .zarr only'
+        )
+    if suffix == '.zarr' and path.is_dir():
+        return partial(_read_zarr, path, geometry_file_of(path, geometry))
     if path.is_dir():
         if (path / r2.META).exists():
             return partial(r2.read_r2, path)
@@ -482,7 +521,7 @@ def _raw_frames(path):
     )
 
 
-_WRITERS = {'naf': naf.write_naf, 'r2': r2.write_r2, 'exr': _write_exr_folder, 'npy': _write_npy}
+_WRITERS = {'naf': naf.write_naf, 'r2': r2.write_r2, 'exr': _write_exr_folder, 'npy': _write_npy, 'zarr': _write_zarr}
 
 
 def history_of(path: PathLike | str) -> Any:
@@ -494,7 +533,7 @@ def history_of(path: PathLike | str) -> Any:
         As `read_scan` does.
     """
     path = Path(path)
-    return load_yaml(geometry_file_of(path, None)).get('history') if path.suffix.lower() == '.npy' else None
+    return load_yaml(geometry_file_of(path, None)).get('history') if path.suffix.lower() in ARRAYS else None
 
 
 def write_scan(path: PathLike | str, dataset: Dataset | Scan, kind: str, history: dict | None = None) -> None:
@@ -504,7 +543,8 @@ def write_scan(path: PathLike | str, dataset: Dataset | Scan, kind: str, history
     ----------
     kind : str
         'naf': a pickle; 'r2': a new R2-Gaussian folder; 'exr': a new folder of EXR views; 'npy': `path` and its .yml, for
-        training views alone, and the mask of valid pixels if there is one.
+        training views alone, and the mask of valid pixels if there is one; 'zarr': a new folder in chunks, and its .yml, for
+        training views alone.
     history : dict or None
         How it was made, plain values by name; for 'npy'.
 

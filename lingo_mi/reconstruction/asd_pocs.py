@@ -3,76 +3,29 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from os import PathLike
 from typing import ClassVar
 
-import drjit as dr
 import mitsuba as mi
 import numpy as np
 from numpy.typing import ArrayLike
 
+from lingo_mi.common.errors import InputError
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.parameters import LARGE, check_bound, check_counts, check_order, check_range
 from lingo_mi.reconstruction.rectify import can_rectify
 from lingo_mi.reconstruction.sart import passes, sweep
-from lingo_mi.reconstruction.system import System, dot, evaluated, norm, scalar
+from lingo_mi.reconstruction.slab_descent import Changes, DescentPlan
+from lingo_mi.reconstruction.slab_sweeps import swept
+from lingo_mi.reconstruction.system import System, dot, evaluated, norm
+from lingo_mi.reconstruction.tv_descent import minimise_tv
 from lingo_mi.scan import Scan
+from lingo_mi.storage.file_access import as_path
 
-EPSILON = 1e-8  # added to squared gradients, relative to their largest value before a descent: TV is not smooth at zero
 LMBDA_MIN = 0.005
-
-
-def _neighbours(size):
-    """Flat indices of the voxels before and after every voxel along x, y, z; at the border the voxel itself."""
-    nx, ny, nz = size
-    index = dr.arange(mi.UInt, nx * ny * nz)
-    line = index // nz
-    x = line // ny
-    position = x, line - x * ny, index - line * nz
-    stride = ny * nz, nz, 1
-    before = [index - dr.select(p > 0, mi.UInt(s), 0) for p, s in zip(position, stride)]
-    after = [index + dr.select(p < n - 1, mi.UInt(s), 0) for p, n, s in zip(position, size, stride)]
-    return before, after
-
-
-def _differences(volume, before):
-    """Backward differences along x, y, z; zero at the border."""
-    return mi.Vector3f([volume - dr.gather(mi.Float, volume, i) for i in before])
-
-
-def tv_floor(volume: mi.Float, size: tuple[int, int, int]) -> mi.Float:
-    """The `floor` for `tv_gradient`, on the device: `EPSILON` times the largest squared gradient of the volume."""
-    before, _ = _neighbours(size)
-    return evaluated(dr.maximum(EPSILON * dr.max(dr.squared_norm(_differences(volume, before))), 1e-30))
-
-
-def tv_gradient(volume: mi.Float, size: tuple[int, int, int], floor: mi.Float) -> mi.Float:
-    """Derivative of the total variation, mi.Float [voxels], for voxels of side 1.
-
-    TV is the sum over the voxels of sqrt(dx^2 + dy^2 + dz^2 + floor), with backward differences that are zero at the
-    border (Sidky and Pan, equation 3). Voxels count as cubes.
-    """
-    before, after = _neighbours(size)
-    difference = _differences(volume, before)
-    inverse = evaluated(dr.rsqrt(dr.squared_norm(difference) + floor))
-    total = dr.sum(difference) * inverse
-    for i in after:  # at the border the difference is zero
-        total -= (dr.gather(mi.Float, volume, i) - volume) * dr.gather(mi.Float, inverse, i)
-    return evaluated(total)
-
-
-def minimise_tv(volume: mi.Float, size: tuple[int, int, int], step: float, tviter: int) -> mi.Float:
-    """`tviter` steps of length `step` (a norm of the change) down the total variation."""
-    floor = tv_floor(volume, size)
-    for _ in range(tviter):
-        gradient = tv_gradient(volume, size, floor)
-        length = norm(gradient)
-        if length == 0:
-            break
-        volume = evaluated(dr.fma(scalar(-step / length), gradient, volume))
-    return volume
 
 
 @dataclass(frozen=True)
@@ -214,19 +167,67 @@ class ASDPOCS(Algorithm):
                 step = self.alpha * data_length
             x = minimise_tv(x, scan.geometry.grid.shape, step, self.tviter)
             tv_change = evaluated(x - projected)
-            tv_length = norm(tv_change)
-            if tv_length > self.rmax * data_length and error() > maxl2err:
-                step *= self.alpha_red
+            changes = Changes(data_length, norm(tv_change), dot(data_change, tv_change))
+            step = self.next_step(step, changes, lambda: error() > maxl2err)
             lmbda *= self.lmbda_red
             if progress:
                 progress(k + 1, self.niter, None if np.isnan(residuals[-1]) else residuals[-1])
-            cosine = dot(data_change, tv_change) / max(data_length * tv_length, 1e-30)
-            if (cosine < -0.99 and error() <= maxl2err) or lmbda < LMBDA_MIN:
+            if self.ends(lmbda, changes, lambda: error() > maxl2err):
                 break
             if watch is not None and watch(k + 1, x):
                 break
         error()  # of the last pass in any case
         return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry.grid)
+
+    def slabs(
+        self, scan: Scan, thickness: int, folder: str | PathLike, *, progress: Progress | None = None
+    ) -> Iterator[np.ndarray]:
+        """The volume in slabs of so many slices along z, as `Sweeps.slabs` gives it, whose arguments these are.
+
+        The folder holds four volumes.
+
+        Raises
+        ------
+        InputError
+            If `exact_every` is above 0, if rays leave voxels out, for too little memory or room on the disk, and for a folder
+            that holds other work.
+
+        Examples
+        --------
+        >>> for slab in ASDPOCS(niter=4).slabs(scan, 64, 'out/work'):
+        ...     ...
+        """
+        return swept(scan, self.plan(scan), thickness, as_path('folder', folder), progress)
+
+    def plan(self, scan: Scan) -> DescentPlan:
+        """What is done with the volume in slabs.
+
+        Raises
+        ------
+        InputError
+            If `exact_every` is above 0.
+        """
+        if self.exact_every:
+            raise InputError(
+                'slabs know no corrections of the projector: leave out exact_every, or make the volume whole'
+            )
+        order = passes(scan.geometry.angles, self.blocksize, self.OrderStrategy, self.seed)
+        updates = [(self.lmbda * self.lmbda_red**k, views) for k in range(self.niter) for views in next(order)]
+        return DescentPlan(updates, self.noneg, self)
+
+    def slab_steps(self, scan: Scan, thickness: int) -> int:
+        """The largest number of steps of `slabs`, for `progress`."""
+        versions = self.niter * (-(-len(scan) // self.blocksize) + self.tviter)
+        return versions * len(scan.geometry.grid.slabs(thickness))
+
+    def next_step(self, step: float, changes: Changes, unmatched: Callable[[], bool]) -> float:
+        """The step of the next pass. unmatched: whether |A x - b| is above `maxl2err`, asked only if that decides."""
+        return step * self.alpha_red if changes.descent > self.rmax * changes.data and unmatched() else step
+
+    def ends(self, lmbda: float, changes: Changes, unmatched: Callable[[], bool]) -> bool:
+        """Whether a pass is the last one. lmbda: of the next one."""
+        cosine = changes.product / max(changes.data * changes.descent, 1e-30)
+        return (cosine < -0.99 and not unmatched()) or lmbda < LMBDA_MIN
 
     def _maxl2err(self, system: System, scan: Scan) -> float:
         """|A x - b| at which the data count as matched."""

@@ -14,13 +14,16 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from math import prod
+from pathlib import Path
 from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 import scipy.fft
+from numpy.lib.format import open_memmap
 from numpy.typing import ArrayLike
 
 from lingo_mi.common.errors import InputError, require_type
@@ -268,18 +271,24 @@ class FDK(Algorithm):
             without `fill`.
         """
         began = time.perf_counter()
+        images, geometry = self.images(scan)
+        volume = backprojected(geometry, images, progress)
+        return Reconstruction(volume, [], time.perf_counter() - began, scan.geometry.grid)
+
+    def images(self, scan: Scan) -> tuple[Callable[[int], np.ndarray], CircularGeometry]:
+        """A function that weights and filters `BATCH` views from its argument on, float32 [view, u, v], and their geometry."""
         projections, geometry = _weighted(with_every_pixel(scan) if self.fill else scan)
 
         def images(first):
             return filtered(projections(first), geometry, self.filter).transpose(0, 2, 1)
 
-        volume = backprojected(geometry, images, progress)
-        return Reconstruction(volume, [], time.perf_counter() - began, scan.geometry.grid)
+        return images, geometry
 
     def slabs(self, scan: Scan, thickness: int, *, progress: Progress | None = None) -> Iterator[np.ndarray]:
         """The volume in slabs of so many slices along z, [x, y, thickness], from the first; the last may be thinner.
 
-        Takes memory for two sets of projections and for three slabs, however large the volume.
+        Takes memory for two sets of projections and for three slabs, however large the volume. Stored views are read again for
+        every slab, and take no memory for sets of them.
 
         Parameters
         ----------
@@ -298,43 +307,66 @@ class FDK(Algorithm):
         """
         parts = scan.geometry.grid.slabs(thickness)
         check_memory(scan.geometry.on(scan.geometry.grid.slab(*parts[0])), needed=_slab_memory(scan, parts[0][1]))
-        views, geometry = self.filtered_views(scan)
-        n = len(geometry)
+        views, n = self.filtered_views(scan), len(scan)
         for k, part in enumerate(parts):
 
             def report(done, *_):
                 if progress:
                     progress(k * n + done, len(parts) * n, None)
 
-            slab = geometry.on(geometry.grid.slab(*part))
-            yield backprojected(slab, lambda first: views[first : first + BATCH], report)
+            yield views.slab(part, report)
 
-    def filtered_views(
-        self, scan: Scan, empty: Callable[[tuple[int, int, int]], np.ndarray] | None = None
-    ) -> tuple[np.ndarray, CircularGeometry]:
-        """All views, weighted and filtered once, for any number of slabs.
+    def filtered_views(self, scan: Scan, file: Path | None = None) -> FilteredViews:
+        """All views, weighted and filtered, for any number of slabs.
 
         Parameters
         ----------
-        empty : callable, optional
-            Makes the array for them from its shape (default: one in memory).
-
-        Returns
-        -------
-        tuple[ndarray, CircularGeometry]
-            Float32 [view, u, v], and their geometry.
+        file : Path or None
+            A new .npy for them (None: in memory). Stored views are filtered when they are needed.
         """
-        projections, geometry = _weighted(with_every_pixel(scan) if self.fill else scan)
+        images, geometry = self.images(scan)
+        if scan.stored is not None:
+            return FilteredViews(geometry, (self, scan))
         n_v, n_u = geometry.nDetector
         shape = len(geometry), n_u, n_v
-        views = np.empty(shape, np.float32) if empty is None else empty(shape)
+        views = np.empty(shape, np.float32) if file is None else open_memmap(file, 'w+', np.float32, shape)
         for first in range(0, len(geometry), BATCH):
-            views[first : first + BATCH] = filtered(projections(first), geometry, self.filter).transpose(0, 2, 1)
-        return views, geometry
+            views[first : first + BATCH] = images(first)
+        return FilteredViews(geometry, views if file is None else file)  # which is complete once the array is gone
 
     def slab_steps(self, scan: Scan, thickness: int) -> int:
         """The number of steps of `slabs`, for `progress`."""
         return len(scan) * len(scan.geometry.grid.slabs(thickness))
+
+
+@dataclass(frozen=True)
+class FilteredViews:
+    """Filtered views from which slabs are made, here or by a worker.
+
+    Parameters
+    ----------
+    geometry : CircularGeometry
+        Of the views and the whole volume.
+    at : ndarray, Path or tuple[FDK, Scan]
+        Float32 [view, u, v]; the .npy that holds them; or what they are made of when they are needed.
+    """
+
+    geometry: CircularGeometry
+    at: np.ndarray | Path | tuple[FDK, Scan]
+
+    def slab(self, part: tuple[int, int], progress: Progress | None = None) -> np.ndarray:
+        """Backproject into the slices [begin, end) of the volume, [x, y, z]."""
+        if isinstance(self.at, tuple):
+            algorithm, scan = self.at
+            images = algorithm.images(scan)[0]
+        else:
+            found = np.load(self.at, mmap_mode='r') if isinstance(self.at, Path) else self.at
+            images = partial(_batch, found)
+        return backprojected(self.geometry.on(self.geometry.grid.slab(*part)), images, progress)
+
+
+def _batch(views, first):
+    return views[first : first + BATCH]
 
 
 def _slab_memory(scan: Scan, thickness: int) -> float:
@@ -342,7 +374,8 @@ def _slab_memory(scan: Scan, thickness: int) -> float:
     level = rectified_geometry(scan.geometry, NAME)
     pixels = 0 if level is scan.geometry else prod(level.nDetector)
     pixels += prod(scan.geometry.nDetector) + prod(extended(level)[0].nDetector)
-    return 4 * (3 * prod(scan.geometry.grid.shape[:2]) * thickness + (len(scan) + 2 * BATCH) * pixels)
+    views = 2 * BATCH + (0 if scan.stored is not None and level is scan.geometry else len(scan))
+    return 4 * (3 * prod(scan.geometry.grid.shape[:2]) * thickness + views * pixels)
 
 
 def _weighted(scan: Scan) -> tuple[Callable[[int], np.ndarray], CircularGeometry]:
@@ -357,7 +390,7 @@ def _weighted(scan: Scan) -> tuple[Callable[[int], np.ndarray], CircularGeometry
 
     def projections(first):
         some = slice(first, first + BATCH)
-        return np.pad(level.projections[some] * rays[some], ((0, 0), (0, 0), columns))
+        return np.pad(level.views(some) * rays[some], ((0, 0), (0, 0), columns))
 
     return projections, geometry
 

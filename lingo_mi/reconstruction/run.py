@@ -18,15 +18,17 @@ from lingo_mi.files.units import PER_MM, Unit
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.jobs.job import Runner
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
+from lingo_mi.reconstruction.asd_pocs import ASDPOCS
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.memory_needs import memory_needed
 from lingo_mi.reconstruction.preconditions import require_signal
 from lingo_mi.reconstruction.sart import Sweeps
 from lingo_mi.reconstruction.slab_cluster import fdk_on, sweep_on
-from lingo_mi.reconstruction.slab_sweeps import discard
+from lingo_mi.reconstruction.slab_volume import discard
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
 
+InSlabs = FDK | Sweeps | ASDPOCS  # what need not hold the whole volume
 MOST_ENTRIES = 2**32  # of one of Dr.Jit's arrays
 
 
@@ -70,7 +72,7 @@ def run_algorithm(
 
 def run_in_slabs(
     scan: Scan,
-    algorithm: FDK | Sweeps,
+    algorithm: InSlabs,
     path: Path,
     thickness: int,
     progress: Progress | None = None,
@@ -94,13 +96,13 @@ def run_in_slabs(
     require_signal(scan)
     path = path.absolute()  # workers have other working directories
     work = path.with_name(path.name + '.slabs')
-    if runner is not None and isinstance(algorithm, FDK):
-        fdk_on(runner, algorithm, scan, thickness, work, path, progress)
+    if isinstance(algorithm, FDK):
+        if runner is not None:
+            fdk_on(runner, algorithm, scan, thickness, work, path, progress)
+        else:
+            return write_slabs(path, scan.geometry.grid, algorithm.slabs(scan, thickness, progress=progress), unit)
     elif runner is not None:
-        assert isinstance(algorithm, Sweeps)
-        sweep_on(runner, scan, *algorithm.updates(scan), thickness, work, path, progress)
-    elif isinstance(algorithm, FDK):
-        return write_slabs(path, scan.geometry.grid, algorithm.slabs(scan, thickness, progress=progress), unit)
+        sweep_on(runner, scan, algorithm.plan(scan), thickness, work, path, progress)
     else:
         write_slabs(path, scan.geometry.grid, algorithm.slabs(scan, thickness, work, progress=progress), unit)
     discard(work)  # not before the volume is safe

@@ -43,7 +43,7 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.parameters import check_bound, check_counts, check_order, check_range
 from lingo_mi.reconstruction.sart_update import update
-from lingo_mi.reconstruction.slab_sweeps import Update, swept
+from lingo_mi.reconstruction.slab_sweeps import SweepPlan, swept
 from lingo_mi.reconstruction.system import System, evaluated
 from lingo_mi.reconstruction.wide_pixels import blurred
 from lingo_mi.scan import Scan
@@ -154,8 +154,8 @@ class Sweeps(Algorithm):
     ) -> Iterator[np.ndarray]:
         """The volume in slabs of so many slices along z, [x, y, thickness], from the first; the last may be thinner.
 
-        Takes memory for seven slabs, two sets of projections (three with invalid pixels), and ten images for each view of a
-        block.
+        Takes memory for seven slabs, the scan (twice with invalid pixels), and ten images for each view of a block. Stored views
+        are read block by block.
 
         Parameters
         ----------
@@ -177,10 +177,10 @@ class Sweeps(Algorithm):
         >>> for slab in OSSART(niter=4).slabs(scan, 64, 'out/work'):
         ...     ...
         """
-        return swept(scan, *self.updates(scan), thickness, as_path('folder', folder), progress)
+        return swept(scan, self.plan(scan), thickness, as_path('folder', folder), progress)
 
-    def updates(self, scan: Scan) -> tuple[list[Update], bool]:
-        """All updates of the volume in slabs, the relaxation and the views of each; whether negative densities become zero.
+    def plan(self, scan: Scan) -> SweepPlan:
+        """All updates of the volume in slabs.
 
         Raises
         ------
@@ -194,7 +194,7 @@ class Sweeps(Algorithm):
             )
         order = passes(scan.geometry.angles, how.blocksize, how.OrderStrategy, how.seed)
         updates = [(how.lmbda * how.lmbda_red**k, views) for k in range(how.niter) for views in next(order)]
-        return updates, how.noneg
+        return SweepPlan(updates, how.noneg)
 
     def slab_steps(self, scan: Scan, thickness: int) -> int:
         """The number of steps of `slabs`, for `progress`."""

@@ -14,14 +14,12 @@ but where the source lies beside the volume: there `GridPair` projects, whose tr
 from __future__ import annotations
 
 import hashlib
-import json
-import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager
+from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -32,17 +30,17 @@ from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.grid import Grid
 from lingo_mi.projectors.fastest import projector_class
 from lingo_mi.reconstruction.algorithm import Progress
+from lingo_mi.reconstruction.fdk import FDK, FilteredViews
 from lingo_mi.reconstruction.preconditions import require_rays
 from lingo_mi.reconstruction.sart_update import normalised, updated
+from lingo_mi.reconstruction.slab_volume import Images, Places, SlabFiles, Volume
 from lingo_mi.reconstruction.system import DIVERGED, evaluated, norm, scalar
 from lingo_mi.reconstruction.wide_pixels import leave_voxels_out
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
-from lingo_mi.storage.file_access import leftovers, read_json, reading, write_text, writing
 from lingo_mi.storage.folder_lock import locked
 
 Update = tuple[float, np.ndarray]  # relaxation; the numbers of the views
-STATE, FILES = 'state.json', ('even.f32', 'odd.f32')
 SLABS, IMAGES = (
     7,
     10,
@@ -62,32 +60,96 @@ class Share(Protocol):
         """
         ...
 
+    def filtered(self, scan: Scan) -> FilteredViews:
+        """The filtered views of a scan, as an argument of the work."""
+        ...
+
+
+@dataclass(frozen=True)
+class SweepPlan:
+    """All that is done with a volume in slabs: updates one after the other.
+
+    Parameters
+    ----------
+    updates : Sequence[Update]
+        Each by a block of views.
+    noneg : bool
+        Whether negative densities become zero.
+    """
+
+    updates: Sequence[Update]
+    noneg: bool
+
+    files: ClassVar[int] = 2
+
+    def system(self, geometry: Geometry, valid: np.ndarray | None, volume: SlabFiles) -> SlabSystem:
+        """What does the work on the slabs."""
+        return SlabSystem(geometry, valid, volume)
+
+    def place(self, done: int) -> Places:
+        """Where the versions lie after so many."""
+        return Places(done % 2 if done else None, (done + 1) % 2)
+
+    def digest(self, scan: Scan, thickness: int) -> str:
+        """A digest of all that the result depends on."""
+        return digest_of(scan, self.updates, self.noneg, thickness)
+
+    def complete(self, system: SlabSystem, share: Share, scan: Scan, progress: Progress | None) -> None:
+        """Do what is left."""
+        volume = system.volume
+        assert isinstance(volume, Volume)  # of which this process keeps the state
+        if volume.done < len(self.updates):
+            steps = Steps(volume.done, len(self.updates), len(volume.parts), progress)
+            lengths = path_lengths(system, share, scan)
+            sweep(system, share, scan, lengths, self.updates[volume.done :], self.noneg, steps)
+
+
+class Steps:
+    """Tells `progress` of every slab that is done."""
+
+    def __init__(self, done: int, versions: int, parts: int, progress: Progress | None):
+        self._done, self._all, self._progress = done * parts, versions * parts, progress
+
+    def __call__(self, relative: float | None = None) -> None:
+        """One slab more. relative: |A x - b| / |b| where it is known."""
+        self._done += 1
+        if self._progress:
+            self._progress(self._done, self._all, relative)
+
 
 def swept(
-    scan: Scan, updates: Sequence[Update], noneg: bool, thickness: int, folder: Path, progress: Progress | None = None
+    scan: Scan, plan: SweepPlan, thickness: int, folder: Path, progress: Progress | None = None
 ) -> Iterator[np.ndarray]:
-    """The volume after the updates, in slabs [x, y, thickness] along z; the last may be thinner.
+    """The volume after all of a plan, in slabs [x, y, thickness] along z; the last may be thinner.
 
     Parameters
     ----------
     folder : Path
         For the files. They stay, so that the volume can be had again at once; `discard` removes them.
     progress : Progress or None
-        Called after every slab as progress(slabs updated, slabs to update in all, |A x - b| / |b| of the views of this update
-        before it).
+        Called after every slab as progress(slabs done, slabs to do in all, |A x - b| / |b| of the views of this update
+        before it, None where it is not known).
 
     Raises
     ------
     InputError
-        For pixels so wide that rays leave voxels out, for too little memory, for a disk without room for two volumes, for a
-        folder that holds other work, and if the volume is not finite.
+        For pixels so wide that rays leave voxels out, for too little memory, for a disk without room for the versions of the
+        volume, for a folder that holds other work, and if the volume is not finite.
     """
-    grid = require_slabs(scan, thickness, updates)
-    with locked(folder), Volume(scan, thickness, folder, digest_of(scan, updates, noneg, thickness)) as volume:
-        system = SlabSystem(scan.geometry, scan.valid, volume)
-        complete(system, here(system), scan.projections, updates, noneg, progress)
-        for part in range(len(grid.slabs(thickness))):
-            yield finite(volume.read(part))
+    with opened(scan, plan, thickness, folder) as volume:
+        system = plan.system(scan.geometry, scan.valid, volume)
+        plan.complete(system, _Here(system), scan, progress)
+        for part in range(len(volume.parts)):
+            yield finite(volume.read(part, volume.places.now))
+
+
+@contextmanager
+def opened(scan: Scan, plan: SweepPlan, thickness: int, folder: Path) -> Iterator[Volume]:
+    """The files of a plan, which this process has for itself; arguments and errors as of `swept`."""
+    grid = require_slabs(scan, thickness, plan.updates)
+    digest = plan.digest(scan, thickness)
+    with locked(folder), Volume(grid, thickness, folder, digest, plan.place, plan.files) as volume:
+        yield volume
 
 
 def require_slabs(scan: Scan, thickness: int, updates: Sequence[Update]) -> Grid:
@@ -120,64 +182,66 @@ def sweep_memory(scan: Scan, thickness: int, blocksize: int) -> int:
     """Peak memory of `swept` with updates of so many views, bytes."""
     nx, ny, nz = scan.geometry.grid.shape
     slab = nx * ny * min(thickness + 2, nz)  # with its slices of zeros
-    images = (2 if scan.valid is None else 3) * len(scan) + IMAGES * blocksize
+    sets = (scan.stored is None) + (scan.valid is not None)
+    images = sets * len(scan) + IMAGES * blocksize
     return 4 * (SLABS * slab + images * prod(scan.geometry.nDetector))
 
 
-def discard(folder: Path) -> None:
-    """Remove the files of `swept`, and their folder if nothing else lies there."""
-    with writing(folder):
-        for name in (*FILES, STATE):  # the state last: it says that the rest is ours
-            (folder / name).unlink(missing_ok=True)
-    with suppress(OSError):
-        folder.rmdir()
+def path_lengths(system: SlabSystem, share: Share, scan: Scan) -> Images:
+    """A 1 of every view."""
+    return summed(system, share('lengths'), scan)
 
 
-def complete(
+def summed(system: SlabSystem, slabs: Iterable[Iterable[np.ndarray]], scan: Scan) -> Images:
+    """The sum of all slabs' images of every view."""
+    total = Images(system.volume.folder, len(scan), system.A.pixels)
+    for images in slabs:
+        total.add(images)
+    return total
+
+
+def sweep(
     system: SlabSystem,
     share: Share,
-    projections: np.ndarray,
+    scan: Scan,
+    lengths: Images,
     updates: Sequence[Update],
     noneg: bool,
-    progress: Progress | None,
+    steps: Steps,
+    planes: int = 0,
 ) -> None:
-    """The updates that are left."""
-    volume = system.volume
-    assert isinstance(volume, Volume)  # of which this process keeps the state
-    if volume.done == len(updates):
-        return
-    parts, pixels = len(volume.parts), system.A.pixels
-    lengths = np.zeros((len(projections), pixels), np.float32)
-    for images in share('lengths'):
-        for view, image in enumerate(images):
-            lengths[view] += image
-    ax = system.nothing(updates[volume.done][1])
-    if volume.done:
-        ax = _added(share('project', updates[volume.done][1]), ax)
-    for done in range(volume.done, len(updates)):
-        lmbda, views = updates[done]
-        error, relative = _error(system, ax, projections[views], lengths[views])
-        following = updates[done + 1][1] if done + 1 < len(updates) else None
-        slabs = iter(range(done * parts + 1, (done + 1) * parts + 1))
+    """Update the volume by some blocks of views. planes: that the last update stores, see `SlabFiles.write`."""
+    volume, following = system.volume, updates[0][1]
+    assert isinstance(volume, Volume)
+    ax = system.nothing(following)
+    if volume.places.now is not None:
+        ax = _added(share('project', following), ax)
+    for i, (lmbda, views) in enumerate(updates):
+        error, relative = _error(system, ax, scan.views(views), lengths[views])
+        following = updates[i + 1][1] if i + 1 < len(updates) else None
+        kept = planes if following is None else 0
 
-        def report(slabs=slabs, relative=relative):
-            if progress:
-                progress(next(slabs), len(updates) * parts, relative)
+        def report(relative=relative):
+            steps(relative)
 
-        images = share('update', error, views, lmbda, noneg, following, slab_done=report)
+        images = share('update', error, views, lmbda, noneg, following, kept, slab_done=report)
         ax = _added(images, None if following is None else system.nothing(following))
         volume.turn()
 
 
-def here(system: SlabSystem) -> Share:
+class _Here:
     """The work in this process, slab by slab."""
 
-    def share(work, *arguments, slab_done=lambda: None):
-        for part in range(len(system.volume.parts)):
-            yield getattr(system, work)(part, *arguments)
+    def __init__(self, system: SlabSystem):
+        self._system = system
+
+    def __call__(self, work, *arguments, slab_done=lambda: None):
+        for part in range(len(self._system.volume.parts)):
+            yield getattr(self._system, work)(part, *arguments)
             slab_done()
 
-    return share
+    def filtered(self, scan: Scan) -> FilteredViews:
+        return FDK().filtered_views(scan)
 
 
 def _added(images: Iterable[Any], total: Any) -> Any:
@@ -196,6 +260,14 @@ def _error(system: SlabSystem, ax: mi.Float, projections: np.ndarray, lengths: n
     if not np.isfinite(relative):
         raise InputError(DIVERGED)
     return evaluated(normalised(error, mi.Float(lengths.ravel()))), relative
+
+
+def digest_of(scan: Scan, updates: Sequence[Update], noneg: bool, thickness: int) -> str:
+    """A digest of all that the result depends on."""
+    found = hashlib.sha256(repr((scan.digest(), projector_class(scan.geometry).__name__, noneg, thickness)).encode())
+    for lmbda, views in updates:
+        found.update(repr((lmbda, views.tolist())).encode())
+    return found.hexdigest()
 
 
 class SlabSystem:
@@ -221,14 +293,27 @@ class SlabSystem:
     def project(self, part: int, views: np.ndarray) -> mi.Float:
         """A x of a slab in some views."""
         A, _ = self._projector(part)
-        return A.forward(self._load(part), views)[0]
+        return A.forward(self._load(part, self.volume.places.now), views)[0]
 
     def update(
-        self, part: int, error: mi.Float, views: np.ndarray, lmbda: float, noneg: bool, following: np.ndarray | None
+        self,
+        part: int,
+        error: mi.Float,
+        views: np.ndarray,
+        lmbda: float,
+        noneg: bool,
+        following: np.ndarray | None,
+        planes: int,
     ) -> mi.Float | None:
-        """Update a slab by the normalised error of some views, and return its A x of the following ones."""
+        """Update a slab by the normalised error of some views, and return its A x of the following ones.
+
+        Parameters
+        ----------
+        planes : int
+            See `SlabFiles.write`.
+        """
         A, x = self._updated(part, error, views, lmbda, noneg)
-        self._store(part, x, A.size)
+        self._store(part, x, A.size, planes)
         return None if following is None else A.forward(x, following)[0]
 
     def nothing(self, views: np.ndarray) -> mi.Float:
@@ -240,7 +325,7 @@ class SlabSystem:
     def _updated(self, part, error, views, lmbda, noneg):
         """The projector of a slab, and the slab after an update."""
         A, inside = self._projector(part)
-        rule = updated(self._load(part), scalar(lmbda), noneg)
+        rule = updated(self._load(part, self.volume.places.now), scalar(lmbda), noneg)
 
         def between_zeros(voxel, *sums):
             return dr.select(inside(voxel), rule(voxel, *sums), 0)
@@ -264,120 +349,9 @@ class SlabSystem:
 
         return A, inside
 
-    def _load(self, part):
-        return mi.Float(np.pad(self.volume.read(part), ((0, 0), (0, 0), self._margins(part))).ravel())
+    def _load(self, part, place):
+        return mi.Float(np.pad(self.volume.read(part, place), ((0, 0), (0, 0), self._margins(part))).ravel())
 
-    def _store(self, part, x, size):
+    def _store(self, part, x, size, planes):
         (begin, end), (below, _) = self.volume.parts[part], self._margins(part)
-        self.volume.write(part, x.numpy().reshape(size)[:, :, below : below + end - begin])
-
-
-class SlabFiles:
-    """A volume in slabs, in two files of a folder: one is read, the other written.
-
-    Attributes
-    ----------
-    parts
-        (begin, end) of the slabs.
-    done
-        How often the files have changed places; before, the volume is zero.
-    folder
-        Of the files.
-    """
-
-    def __init__(self, grid: Grid, thickness: int, folder: Path, done: int = 0):
-        self.parts, self.done = grid.slabs(thickness), done
-        self._size, self.folder = grid.shape, folder
-        self._paths = [folder / name for name in FILES]
-
-    def __enter__(self):
-        with writing(self.folder):
-            flags = os.O_RDWR | os.O_CREAT | getattr(os, 'O_BINARY', 0)
-            self._files = [os.fdopen(os.open(path, flags, 0o666), 'r+b', buffering=0) for path in self._paths]
-        return self
-
-    def __exit__(self, *error):
-        for file in self._files:
-            file.close()
-
-    def read(self, part: int) -> np.ndarray:
-        """A slab, float32 [x, y, slices]."""
-        shape, start = self._place(part)
-        if not self.done:
-            return np.zeros(shape, np.float32)
-        path, file = self._paths[self.done % 2], self._files[self.done % 2]
-        with reading(path):
-            file.seek(start)
-            values = np.fromfile(file, np.float32, prod(shape))
-        if len(values) < prod(shape):
-            raise InputError(f'{path}: is cut off; remove its folder, and begin again')
-        return values.reshape(shape)
-
-    def write(self, part: int, slab: np.ndarray) -> None:
-        """Set a slab of the next volume."""
-        file = self._files[(self.done + 1) % 2]
-        with writing(self.folder):
-            file.seek(self._place(part)[1])
-            np.ascontiguousarray(slab).tofile(file)
-
-    def flush(self) -> None:
-        """Bring what was written to the disk."""
-        with writing(self.folder):
-            os.fsync(self._files[(self.done + 1) % 2].fileno())
-
-    def _place(self, part):
-        (begin, end), (nx, ny, _) = self.parts[part], self._size
-        return (nx, ny, end - begin), 4 * nx * ny * begin
-
-
-class Volume(SlabFiles):
-    """The files, and the state that says how far their work has come."""
-
-    def __init__(self, scan: Scan, thickness: int, folder: Path, digest: str):
-        super().__init__(scan.geometry.grid, thickness, folder)
-        self._digest = digest
-        state = folder / STATE
-        for path, _ in leftovers(folder):
-            path.unlink()
-        if state.exists():
-            known = read_json(state)
-            try:
-                found, done = known['of'], int(known['updates'])
-            except (KeyError, TypeError, ValueError):
-                raise InputError(f'{state}: is not a state of ours; move its folder away') from None
-            if found != digest:
-                raise InputError(
-                    f'{folder}: holds a reconstruction of other data or with other options, which was stopped; '
-                    'remove the folder, or repeat that command to complete it'
-                )
-            if self._paths[done % 2].exists():  # else it was being discarded
-                self.done = done
-        elif any(os.path.lexists(path) for path in self._paths):
-            raise InputError(f'{folder}: has files named {" or ".join(FILES)} that are not ours; choose another folder')
-        self._require_room()
-        self._record()
-
-    def _require_room(self):
-        needed = 8 * prod(self._size) - sum(path.stat().st_size for path in self._paths if path.exists())
-        if needed > (free := shutil.disk_usage(self.folder).free):
-            raise InputError(
-                f'{self.folder}: two volumes need {needed / 2**30:,.1f} GiB more of the disk, which has '
-                f'{free / 2**30:,.1f}; choose another disk, or fewer voxels'
-            )
-
-    def turn(self) -> None:
-        """The next volume is complete: it becomes the one that is read."""
-        self.flush()
-        self.done += 1
-        self._record()
-
-    def _record(self):
-        write_text(self.folder / STATE, json.dumps({'of': self._digest, 'updates': self.done}))
-
-
-def digest_of(scan: Scan, updates: Sequence[Update], noneg: bool, thickness: int) -> str:
-    """A digest of all that the result depends on."""
-    found = hashlib.sha256(repr((scan.digest(), projector_class(scan.geometry).__name__, noneg, thickness)).encode())
-    for lmbda, views in updates:
-        found.update(repr((lmbda, views.tolist())).encode())
-    return found.hexdigest()
+        self.volume.write(part, x.numpy().reshape(size)[:, :, below : below + end - begin], planes)

@@ -93,6 +93,8 @@ def take_scan(
 def with_effects(dataset: Dataset, loaded: LoadedScene) -> Dataset:
     """The data set with the effects of the scene's tube and detector."""
     effects = find_effects(loaded.scene, loaded.scanner)
+    if effects is None and dataset.train.effects is None:
+        return dataset  # stored views stay where they are
     return replace(
         dataset,
         train=replace(dataset.train, effects=effects),

@@ -21,11 +21,11 @@ from lingo_mi.metrics.quality import psnr_3d_r2
 from lingo_mi.phantoms.x3d_scan import default_geometry
 from lingo_mi.projectors.grid import project_volume
 from lingo_mi.reconstruction import ASDPOCS, CGLS, FDK, OSSART, SART, SIRT, Refined
-from lingo_mi.reconstruction.asd_pocs import tv_floor, tv_gradient
 from lingo_mi.reconstruction.refined import structure
 from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.reconstruction.sart import blocks
 from lingo_mi.reconstruction.system import System
+from lingo_mi.reconstruction.tv_descent import tv_floor, tv_gradient
 from lingo_mi.scan import Scan
 
 

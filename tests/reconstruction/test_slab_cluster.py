@@ -11,10 +11,12 @@ import pytest
 import lingo_mi as lm
 from helpers.dask_cluster import cluster, wait_until
 from lingo_mi.common.errors import InputError
+from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.files.volumes import read_volume
+from lingo_mi.files.zarr_views import ZarrViews
 from lingo_mi.geometry import Grid
 from lingo_mi.jobs.in_process import InProcess
-from lingo_mi.reconstruction import FDK, OSSART, SART
+from lingo_mi.reconstruction import ASDPOCS, FDK, OSSART, SART
 from lingo_mi.reconstruction.run import run_in_slabs
 
 pytest.importorskip('distributed')
@@ -42,7 +44,9 @@ def require_same(found, wanted):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize('algorithm', [FDK(), OSSART(niter=2, blocksize=4)], ids=lambda a: a.name)
+@pytest.mark.parametrize(
+    'algorithm', [FDK(), OSSART(niter=2, blocksize=4), ASDPOCS(niter=1, tviter=2, blocksize=5)], ids=lambda a: a.name
+)
 def test_the_volume_of_one_process(scan, tmp_path, algorithm):
     """By the same jobs, in this process."""
     lm.reconstruct(scan, algorithm, slab=64, out=tmp_path / 'one.ome.zarr', progress=False)
@@ -51,6 +55,28 @@ def test_the_volume_of_one_process(scan, tmp_path, algorithm):
     require_same(tmp_path / 'many.ome.zarr', tmp_path / 'one.ome.zarr')
     assert steps[-1] == algorithm.slab_steps(scan, 64) and steps == sorted(steps)
     assert sorted(p.name for p in tmp_path.iterdir()) == ['many.ome.zarr', 'one.ome.zarr']
+
+
+@pytest.mark.parametrize('algorithm', [FDK(), ASDPOCS(niter=1, tviter=1, blocksize=3)], ids=lambda a: a.name)
+def test_stored_views(scan, tmp_path, algorithm, monkeypatch):
+    """Read some at a time, never all, by one process and by workers; a chunk that is missing is named."""
+    few = replace(scan, geometry=scan.geometry.on(Grid((8, 8, 80), (4.0, 3.0, 3.75))))  # two slabs
+    write_scan(tmp_path / 'scan.zarr', few, 'zarr')
+    stored, read = read_scan(tmp_path / 'scan.zarr').train, ZarrViews.__getitem__
+    numbers = []
+    monkeypatch.setattr('lingo_mi.scan.PIECE', 4)
+    monkeypatch.setattr(ZarrViews, '__getitem__', lambda self, i: numbers.append(len(self.numbers[i])) or read(self, i))
+    run_in_slabs(few, algorithm, tmp_path / 'wanted.ome.zarr', 64)
+    assert not numbers
+    lm.reconstruct(stored, algorithm, slab=64, out=tmp_path / 'one.ome.zarr', progress=False)
+    run_in_slabs(stored, algorithm, tmp_path / 'many.ome.zarr', 64, runner=InProcess())
+    for found in 'one.ome.zarr', 'many.ome.zarr':
+        require_same(tmp_path / found, tmp_path / 'wanted.ome.zarr')
+    assert 0 < max(numbers) <= 4 and 'projections' not in vars(stored)
+    (tmp_path / 'scan.zarr' / 'c' / '0' / '0' / '0').unlink()
+    with pytest.raises(InputError, match='scan.zarr: lacks a chunk of the views 0 to 3'):
+        run_in_slabs(stored, algorithm, tmp_path / 'none.ome.zarr', 64, runner=InProcess())
+    assert not (tmp_path / 'none.ome.zarr').exists()
 
 
 def test_invalid_pixels(scan, tmp_path):

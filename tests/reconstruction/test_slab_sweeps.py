@@ -19,7 +19,8 @@ from lingo_mi.geometry import Grid, PosedGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.reconstruction import OSSART, SART, SIRT
 from lingo_mi.reconstruction.run import run_algorithm
-from lingo_mi.reconstruction.slab_sweeps import digest_of, discard
+from lingo_mi.reconstruction.slab_sweeps import digest_of
+from lingo_mi.reconstruction.slab_volume import discard
 
 RECONSTRUCT = FIT.with_name('reconstruct.py')
 SHAPE = 24, 20, 16

@@ -1,0 +1,96 @@
+"""Projections in a Zarr array: read where they are needed, and one line for what is missing."""
+
+import pickle
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import lingo_mi as lm
+from lingo_mi.common.errors import InputError
+from lingo_mi.files.scans import read_scan, write_scan
+from lingo_mi.scan import Scan
+
+zarr = pytest.importorskip('zarr')
+
+
+@pytest.fixture
+def scan():
+    geometry = lm.Geometry.cone(
+        DSO=500, DSD=800, nDetector=(6, 8), dDetector=2.0, nVoxel=8, dVoxel=2.0, angles=np.linspace(0, 6, 10)
+    )
+    return Scan(geometry, np.random.default_rng(0).random((10, 6, 8), np.float32))
+
+
+@pytest.fixture
+def path(scan, tmp_path):
+    write_scan(tmp_path / 'scan.zarr', scan, 'zarr')
+    return tmp_path / 'scan.zarr'
+
+
+def test_what_was_written(scan, path):
+    found = read_scan(path).train
+    np.testing.assert_array_equal(found.views([7, 2]), scan.projections[[7, 2]])
+    np.testing.assert_array_equal(found.subset(slice(1, 9, 3)).views([2, 0]), scan.projections[[7, 1]])
+    assert 'projections' not in vars(found) and str(path) in repr(found)
+    there = pickle.loads(pickle.dumps(found.on(scan.geometry.grid)))
+    np.testing.assert_array_equal(np.concatenate(list(there.pieces())), scan.projections)
+    assert found.digest() == scan.digest()
+    np.testing.assert_array_equal(found.projections, scan.projections)  # all of them, where a caller wants so
+    np.testing.assert_array_equal(replace(found, effects=None).projections, scan.projections)
+    assert lm.load(path, views=5).test.views(slice(None)).shape == (5, 6, 8)
+
+
+def test_others_zarr_2(scan, path):
+    shutil.rmtree(path)
+    array = zarr.create_array(str(path), shape=(10, 6, 8), chunks=(3, 6, 4), dtype='float64', zarr_format=2)
+    array[:] = scan.projections
+    np.testing.assert_array_equal(read_scan(path).train.views([9]), scan.projections[[9]])
+
+
+def refused(words, do):
+    with pytest.raises(InputError, match=words) as error:
+        do()
+    assert 'scan.' in str(error.value) and '\n' not in str(error.value)
+
+
+def test_a_chunk_is_missing(path):
+    found = read_scan(path).train
+    (path / 'c' / '1' / '0' / '0').unlink()
+    refused('scan.zarr: lacks a chunk of the views 4 to 7', lambda: read_scan(path))
+    refused('scan.zarr: lacks a chunk of the views 4 to 7', lambda: found.views([1, 5]))
+    assert found.views([9]).shape == (1, 6, 8)
+
+
+def test_a_chunk_ends_early(path):
+    file = path / 'c' / '2' / '0' / '0'
+    file.write_bytes(file.read_bytes()[:100])
+    found = read_scan(path).train
+    assert found.views([0]).shape == (1, 6, 8)
+    refused('scan.zarr: a chunk of the views 8 to 9 is cut off or damaged', lambda: found.views([9, 8]))
+
+
+def test_bad_input(scan, path):
+    array = zarr.open_array(str(path))
+    array[5, 0, 0] = np.nan
+    refused('view 5 holds NaN', lambda: read_scan(path).train.views([4, 5]))
+    geometry = path.with_suffix('.yml')
+    words = geometry.read_text()
+    geometry.write_text(words + 'input: intensity\nI0: 2\n')
+    refused('are line integrals', lambda: read_scan(path))
+    geometry.write_text(words.replace('nDetector: [6, 8]', 'nDetector: [6, 9]'))
+    refused(r'have the shape \(10, 6, 8\)', lambda: read_scan(path))
+    geometry.unlink()
+    refused('needs its scan geometry', lambda: read_scan(path))
+    geometry.write_text(words)
+    shutil.rmtree(path)
+    zarr.create_array(str(path), shape=(10, 8), chunks=(3, 8), dtype='float32')
+    refused('real numbers .n, v, u. are needed', lambda: read_scan(path))
+    shutil.rmtree(path)
+    zarr.create_array(str(path), shape=(8, 6, 8), chunks=(2, 6, 8), shards=(4, 6, 8), dtype='float32')
+    refused('shards', lambda: read_scan(path))
+    (path / 'zarr.json').write_text('{')
+    refused('damaged', lambda: read_scan(path))
+    refused('ends in .zarr', lambda: write_scan(path.with_name('scan.a'), scan, 'zarr'))
+    refused('exists already', lambda: write_scan(path, scan, 'zarr'))
