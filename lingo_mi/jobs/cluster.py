@@ -158,7 +158,7 @@ class Cluster:
                 f'no worker of the cluster came within {PATIENCE:.0f} s; start some, by `dask worker --nthreads 1`'
             ) from None
         for worker in self.client.run(describe_worker, self.folder).values():
-            require_fit(worker, self.folder)
+            require_fit(worker, self.folder, self.variant)
 
 
 def _gone() -> tuple[type[BaseException], ...]:

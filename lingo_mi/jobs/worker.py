@@ -14,20 +14,31 @@ PAUSE = 1.0  # seconds between two reports
 
 
 def describe_worker(folder: str, dask_worker: Any) -> dict:
-    """Version, threads for tasks, address of this worker, and whether it sees a folder; called by `Client.run`."""
+    """Version, variants, threads for tasks, address of this worker, and whether it sees a folder; called by `Client.run`."""
+    import mitsuba as mi
+
     return dict(
         version=version('lingo_mi'),
+        variants=mi.variants(),
         tasks=dask_worker.state.nthreads,
         address=dask_worker.address,
         sees=Path(folder).is_dir(),
     )
 
 
-def require_fit(worker: dict, folder: str) -> None:
-    """Raises InputError if a worker, by what `describe_worker` says, cannot do the jobs."""
+def require_fit(worker: dict, folder: str, variant: str | None) -> None:
+    """Raises InputError if a worker, by what `describe_worker` says, cannot do the jobs.
+
+    Parameters
+    ----------
+    variant : str or None
+        Of Mitsuba, that it must have; None: it chooses.
+    """
     who = f'worker {worker["address"]}'
     if worker['version'] != (ours := version('lingo_mi')):
         raise InputError(f'{who}: has lingo_mi {worker["version"]}, not {ours}; install the same there')
+    if variant is not None and variant not in worker['variants']:
+        raise InputError(f'{who}: its Mitsuba has no variant {variant}; install the same Mitsuba there')
     if worker['tasks'] != 1:
         raise InputError(
             f'{who}: runs {worker["tasks"]} tasks at once, which would share one Dr.Jit; start it by `dask worker --nthreads 1`'
@@ -68,8 +79,11 @@ def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str
                 raise KeyboardInterrupt
 
     try:
-        require_fit(describe_worker(folder, worker), folder)
-        _prepare(threads, variant)
+        require_fit(describe_worker(folder, worker), folder, variant)
+        try:
+            _prepare(threads, variant)
+        except InputError as error:
+            raise InputError(f'worker {worker.address}: {error}') from None
         event = attempt(job, report, lambda event: worker.log_event(topic, event))
         return event._replace(value=f'{event.value} (worker {worker.address})') if event.kind == 'failed' else event
     except InputError as error:
