@@ -15,7 +15,7 @@ from lingo_mi.inspection.dead_columns import dead_columns
 from lingo_mi.inspection.jitter import outline_jitter
 from lingo_mi.inspection.text_order import text_order
 from lingo_mi.raw.line_integrals import MOST_VIEWS, photons_of_images
-from lingo_mi.scan import Scan
+from lingo_mi.scan import PIECE, Scan
 
 COLUMNS = 128  # of the plane: enough for a tenth of a pixel, few for all pairs
 VIEWS = 40  # of the plane: the time goes with its square
@@ -291,11 +291,12 @@ def warn_of_intensities(scan: Scan) -> None:
 def open_beam(scan: Scan) -> float | None:
     """The intensity beside the object, or None if projections do not look like intensities.
 
-    Intensities are highest, and alike, at the left and right edge of the panel. At most 64 views are examined.
+    Intensities are highest, and alike, at the left and right edge of the panel. At most 64 views are examined, of stored ones 16.
     """
-    if len(scan) > MOST_VIEWS:
-        scan = scan.subset(np.arange(MOST_VIEWS) * len(scan) // MOST_VIEWS)
-    p, edge = scan.projections, max(1, scan.geometry.nDetector[1] // 64)
+    most = MOST_VIEWS if scan.stored is None else PIECE
+    if len(scan) > most:
+        scan = scan.subset(np.arange(most) * len(scan) // most)
+    p, edge = scan.views(slice(None)), max(1, scan.geometry.nDetector[1] // 64)
     valid = np.ones(p.shape, bool) if scan.valid is None else scan.valid
     sides = np.concatenate([p[:, :, part][valid[:, :, part]] for part in (slice(0, edge), slice(-edge, None))])
     if not sides.size:

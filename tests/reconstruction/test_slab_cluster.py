@@ -65,6 +65,7 @@ def test_stored_views(scan, tmp_path, algorithm, monkeypatch):
     stored, read = read_scan(tmp_path / 'scan.zarr').train, ZarrViews.__getitem__
     numbers = []
     monkeypatch.setattr('lingo_mi.scan.PIECE', 4)
+    monkeypatch.setattr('lingo_mi.inspection.measure.PIECE', 4)
     monkeypatch.setattr(ZarrViews, '__getitem__', lambda self, i: numbers.append(len(self.numbers[i])) or read(self, i))
     run_in_slabs(few, algorithm, tmp_path / 'wanted.ome.zarr', 64)
     assert not numbers
