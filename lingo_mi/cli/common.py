@@ -156,7 +156,7 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
         '--projections',
         metavar='F',
         help='measured projections: X3D/NAF pickle, R2 folder, HTC or walnut .npz, '
-        '.npy with a geometry .yml beside it, or a folder of EXR images',
+        '.npy or .zarr with a geometry .yml beside it, or a folder of EXR images',
     )
     parser.add_argument(
         '--volume',
