@@ -3,13 +3,13 @@
     import lingo_mi as lm
 
     data = lm.simulate('x3d_foot', views=25)            # or lm.load('scan.pickle')
-    fit = lm.fit(data, lm.LINGO())                      # or lm.Fast(), lm.R2(), ...
+    fit = lm.fit(data, lm.Fast())                       # half a minute; or lm.LINGO(), lm.R2(), ...
     fit.volume()                                        # [x, y, z], density per mm
     fit.render(data.test.geometry)                      # [view, v, u], line integrals
     lm.reconstruct(data.train, lm.SART(niter=20), start=fit)
-    images = lm.project(fit.gaussians, data.test.geometry)    # also of arrays of NumPy, Dr.Jit, PyTorch, JAX
+    images = lm.project(fit.gaussians, data.test.geometry)    # or four arrays of NumPy, Dr.Jit, PyTorch, JAX
 
-The names below are loaded on first use, and choose a variant of Mitsuba if none is active. `import lingo_mi` and
+Each name is loaded on first use. If no variant of Mitsuba is active, this chooses one. `import lingo_mi` and
 `mitsuba.set_variant(...)`, in either order, make the plugins known to Mitsuba.
 """
 

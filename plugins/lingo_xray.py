@@ -27,8 +27,8 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
 
      * - accuracy
        - |string|
-       - A preset of the cut-off, with these relative L2 errors and times relative to the default's, of an image and with
-         its derivatives (docs/accuracy.md says of what, and why):
+       - A preset of the cut-off, with these relative L2 errors of an image and its derivatives, and times relative
+         to the default's (docs/accuracy.md names the objects):
 
          =============  =======  ========  =================  ======  ==============
          preset         extent   image     worst derivative   time    with gradients
@@ -50,22 +50,22 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
      * - pixel
        - |string| or |int|
        - `centre`, the ray through a pixel's centre; `area`, the mean over the pixel in closed form, at hardly more cost, for
-         scenes of Gaussians alone (each footprint convolved with a Gaussian of the pixel's variance: off by a
-         thousandth where a standard deviation is a pixel, by the fourth power of their ratio elsewhere); or n, the mean
-         over n x n rays, for pixels that are not small against any object. With n, intensities are averaged in
-         transmission, as a detector does. Time and memory grow with n x n.
+         scenes of Gaussians alone (each footprint is convolved with a Gaussian of the pixel's variance; the relative
+         error is 1e-3 if a standard deviation is one pixel, and falls with the fourth power of their ratio); or n, the mean
+         over n x n rays, for pixels that are not small against any object. `area` averages line integrals, and n averages
+         transmissions, as a detector does; at edges they differ. Time and memory grow with n x n.
          (Default: `centre`)
      * - output
        - |string|
-       - `line_integral`, the integral of the density along the ray, ln(I0 / I); or `transmission`, I / I0 = exp(-integral),
-         which float32 holds for integrals above -88: where densities are more negative, it is infinite, without a
-         warning, since to look for one every rendering would have to wait for the device.
+       - `line_integral`, the integral of the density along the ray, ln(I0 / I); or `transmission`, I / I0 = exp(-integral).
+         If an integral is below -88, the transmission overflows float32 to infinity. There is no warning, because the check
+         would make every rendering wait for the device.
          (Default: `line_integral`)
 
     Beer-Lambert line integrals through everything in the scene that attenuates:
 
     - `ellipsoids` shapes with a `density` attribute: a cloud of 3D Gaussians, in closed form (see
-      `lingo_mi.projectors.footprint`); density is the value at a Gaussian's centre, the sum needs no order;
+      `lingo_mi.projectors.footprint`); density is the value at a Gaussian's centre, and the sum needs no order;
     - a `cube` with an interior `heterogeneous` medium on a `gridvolume`: exact for trilinear interpolation. Mitsuba does
       not tell which `filter_type` and `wrap_mode` a volume has, so the defaults, `trilinear` and `clamp`, are assumed;
     - a closed mesh with an interior `homogeneous` medium: exact path lengths by rasterisation;
@@ -77,8 +77,8 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
 
     Objects overlap additively. A kind of object that a scene lacks adds no code to its kernels. Rays are those of pixel
     centres (see `pixel`): no random numbers, whatever the sample count. Sensors: `ct_scanner`,
-    `perspective` and `orthographic`, and a `batch` of them, whose views stand side by side in its film. Of a film with a
-    crop window, only that is rendered. Integrals begin at a cone beam's source, and do not end at the panel.
+    `perspective` and `orthographic`, and a `batch` of them, whose views stand side by side in its film. If the film has a
+    crop window, only the window is rendered. Integrals begin at a cone beam's source, and do not end at the panel.
     Those of a parallel beam are never cut.
 
     Works in `llvm_ad_*` and `cuda_ad_*`, `mono` and `rgb`; not within `dr.freeze`, nor inside `aov` or `moment`, since it

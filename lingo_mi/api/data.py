@@ -42,7 +42,7 @@ def simulate(
     parameters: dict | None = None,
     progress: bool = True,
 ) -> Dataset:
-    """Simulate a scan: exact line integrals of an object, as the scanner would see it.
+    """Simulate a scan: exact line integrals of an object, and then the effects that a scene names.
 
     Parameters
     ----------
@@ -51,8 +51,8 @@ def simulate(
         [x, y, z] of densities per mm (NumPy, or anything with `__array__` or `__dlpack__`).
     geometry : Geometry or None
         The scanner of a phantom or a volume. A volume must have `geometry.grid.shape` voxels. Without a geometry, a phantom is
-        scanned as in X3D: a cone beam, `views` views over half a turn (default: 50), and as many random ones held out. A phantom
-        on another grid than its own is scanned as voxels, not as a formula.
+        scanned as in X3D: a cone beam, `views` views over half a turn (default: 50), and as many random ones held out. If
+        the grid of the geometry is not the phantom's, voxels are scanned instead of the formula.
     views : int or None
         How many of the views to fit, evenly spaced (default: all). The rest are held out, unless the scene or `held_out`
         provides held-out views. For a phantom without a geometry: how many views to scan.
@@ -75,7 +75,7 @@ def simulate(
     ------
     InputError
         If the source is unknown, does not fit the geometry, needs more memory than there is, or is a volume whose negative values
-        look like Hounsfield units (`docs/how_to/scan_volume.md` says how to convert them).
+        look like Hounsfield units (`docs/how_to/own_volume.md` says how to convert them).
 
     Examples
     --------

@@ -56,8 +56,8 @@ def fit(
         The views to fit. A `Dataset` gives its `train`, and the fit measures its quality on the held-out views and the true
         volume.
     method : Method or str
-        `Fast` (the default), `LINGO` or `R2` (published methods), `GaussianSplatting` or `XGaussian` (baselines that composite
-        opacities, and so make views but no volume), `NAF` (a neural field), or a method that you wrote. A text names the method
+        `Fast` (the default), `LINGO` or `R2` (published methods), `GaussianSplatting` or `XGaussian` (baselines that use alpha
+        compositing, and so make views but no volume), `NAF` (a neural field), or a method that you wrote. A text names the method
         and its options: 'lingo:V_S=1'.
     hold_out : int or None
         One view in `hold_out` is not fitted, and measures how well the fit predicts unseen views. 0 fits all views. The default

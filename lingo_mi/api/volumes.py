@@ -95,16 +95,16 @@ def reconstruct(
         A fit to this scan, or a volume [x, y, z] in 1/mm, to start from. `Refined` needs one.
     views : int, optional
         How many views to reconstruct from, with a fit as `start`. The fit renders those that were not measured (the second stage
-        of the paper), and the algorithm starts from an empty volume. The scan must be on a circle. `Refined` uses these views
+        of the paper), and the volume starts empty. The scan must be on a circle. `Refined` uses these views
         first, and then the measured ones. Without `views`, it uses the measured ones alone.
     out : path, optional
         Write the volume there (.nii, .nii.gz, .ome.zarr or .dicom), as `Reconstruction.save` does.
     units, mu_water
         Units of the values in that file: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm (`Reconstruction.save`).
     slab : int, optional
-        Slices of a slab. `FDK`, `SART`, `OSSART`, `SIRT` and `ASDPOCS` then make the volume slab by slab and write each to `out`,
-        so the volume need not fit into memory. Iterative ones store the volume in a folder beside `out`, whose name ends in
-        .slabs, while they work. If they are stopped, the same call continues.
+        Number of slices in a slab. `FDK`, `SART`, `OSSART`, `SIRT` and `ASDPOCS` then make the volume slab by slab and write each
+        to `out`, so the volume need not fit into memory. Iterative ones store the volume in a folder beside `out`, whose name
+        ends in .slabs, while they work. If they are stopped, the same call continues.
     cluster : str or Client, optional
         A Dask cluster whose workers make the slabs (default: of 64 slices) and write them to `out`, an .ome.zarr: the scheduler's
         address or file, 'local:N' for N processes of this machine, or a client of `distributed`. Workers must see the folder of

@@ -33,7 +33,8 @@ class Projector(LinearMap):
     """Line integrals of a voxel volume in the views of a scan, A, and backprojection, its transpose A.T.
 
     `A(volume)` takes densities [x, y, z], per mm, and returns line integrals [view, v, u] without a unit. `A.T(projections)`
-    returns a number for each voxel: the sum over all pixels of the pixel's value times the length of its ray in the voxel, in mm.
+    returns a number for each voxel: the sum over all pixels of the pixel's value times the weight of the voxel in the pixel's
+    line integral, in mm.
     A.T is the transpose of A to rounding. Both take and return arrays of NumPy, Dr.Jit, PyTorch or JAX, with leading batch axes,
     and are differentiable in them. Computation is in float32.
 
@@ -149,10 +150,12 @@ class Projector(LinearMap):
             For an array of another shape or kind, or with NaN or infinity, for rays that make no view, and if the result does
             not fit into memory.
 
-        Notes ----- Derivatives with respect to the rays are those of the model, and at kinks of its interpolation the mean of
-        both sides. They do not contain the jumps of Joseph's model. This model jumps if a sample enters the box and the volume is
-        not zero at its faces, if the main axis of a ray changes, and, for a ray of a cone that is steeper than 45 degrees in
-        voxels, if the panel begins to lean. If these jumps matter, use `model='exact'`, which has none.
+        Notes
+        -----
+        Derivatives with respect to the rays are those of the model, and at kinks of its interpolation the mean of both sides.
+        They do not contain the jumps of Joseph's model. This model jumps if a sample enters the box and the volume is not zero at
+        its faces, if the main axis of a ray changes, and, for a ray of a cone that is steeper than 45 degrees in voxels, if the
+        panel begins to lean. If these jumps matter, use `model='exact'`, which has none.
 
         Examples
         --------

@@ -140,9 +140,9 @@ class Geometry(ABC):
             Radians, n >= 1. Whole numbers over more than four turns cause a warning, because they look like degrees.
         **placement
             The voxels: either `grid`, or TIGRE's numbers (x, y, z): nVoxel, dVoxel in mm, and offOrigin, the centre, in mm. The
-            other numbers are 0 by default, and `trajectories.Motion` defines them: offDetector, (v, u) mm, shifts the panel,
-            positive v up; rotDetector, (roll, pitch, yaw) radians, turns it; COR, mm, is for an axis off centre; tilt, radians,
-            lifts the source out of the plane of rotation; height, mm, once or for every view, lifts source and panel.
+            other numbers are 0 by default, and `trajectories.Motion` defines them: offDetector, (v, u) mm, shifts the panel, a
+            positive v towards +z; rotDetector, (roll, pitch, yaw) radians, turns it; COR, mm, is for an axis off centre; tilt,
+            radians, lifts the source out of the plane of rotation; height, mm, once or for every view, lifts source and panel.
 
         Returns
         -------

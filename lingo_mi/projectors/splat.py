@@ -274,7 +274,7 @@ def _row(layout: Layout, i: _Item, y):
 
 
 def _shape(t, i: _Item, m, d0, d1):
-    """The footprint without its amplitude: 1/den, the exponent of 2, which is -num/den log2(e)/2, and the value."""
+    """The footprint without its amplitude: 1/den, the exponent of 2, and den^(-1/2) exp(-num / (2 den)) (`footprint`)."""
     u = i.mu * t
     num = dr.fma(-u, u, m * -HALF_LOG2E)
     root = dr.rsqrt(dr.fma(t, dr.fma(i.e11, t, d1), d0))

@@ -134,8 +134,9 @@ class Best(Algorithm):
        of Gaussians to the other views, and tries the best of these refinements from the cloud's volume.
     4. The setting that predicts the held-out views best, with its number of passes, is applied to all views.
 
-    Smaller voxels suit objects finer than the voxels, because voxels turn such detail into streaks. Streaks lie along the views
-    of the reconstruction, and held-out views hardly show them. The scan's own voxels must therefore be better by `MARGIN`.
+    Smaller voxels suit objects finer than the voxels, because the scan's voxels turn such detail into streaks. Streaks lie along
+    the views of the reconstruction, and held-out views hardly show them. The scan's own voxels must therefore be better by
+    `MARGIN`.
 
     Parameters
     ----------

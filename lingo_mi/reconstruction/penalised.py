@@ -39,8 +39,8 @@ class PenalisedLeastSquares(Algorithm):
     """Least squares with a prior: minimises 1/2 (A x - b)^T W (A x - b) + strength max(A^T W b) R(x) over 0 <= x <= `upper`.
 
     The proximal map of the prior follows each step of gradient descent, whose length is 1 / |A^T W A|. The gradient of a prior's
-    smooth part is added to the gradient of the data term. Nesterov's momentum accelerates the steps (FISTA). It restarts when it
-    points uphill.
+    smooth part is added to the gradient of the data term. Nesterov's momentum accelerates the steps (FISTA), and is
+    reset when it points uphill.
 
     Parameters
     ----------
