@@ -38,7 +38,9 @@ def test_mutated_files_in_this_process(tmp_path, name, rng):
     assert verdict(name, tmp_path, rng) in ('value', 'refused')
 
 
-@pytest.mark.parametrize('cases', [10, pytest.param(5000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    'cases', [10, pytest.param(40, marks=pytest.mark.thorough), pytest.param(5000, marks=pytest.mark.slow)]
+)
 def test_mutated_files_in_children(cases):
     """Under a limit of time and memory; also scenes, whose reader is not Python alone."""
     tallies = run(NAMES, cases, seed=1)

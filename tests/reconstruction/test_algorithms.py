@@ -121,6 +121,7 @@ def test_iterations_by_default():
         ('sart', dict(tol='0'), "tol must be from 0 to 1e+18, not '0'"),
         ('sart', dict(lmbda=2.5), 'lmbda must be above 0 and at most 2, not 2.5'),
         ('sart', dict(lmbda_red=0), 'lmbda_red must be above 0 and at most 1, not 0'),
+        ('asd-pocs', dict(lmbda_red=1.1), 'lmbda_red must be above 0 and at most 1, not 1.1'),
         (
             'sart',
             dict(OrderStrategy='any'),
