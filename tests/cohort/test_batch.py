@@ -282,7 +282,7 @@ def test_names_that_collide(home):
     )
     with pytest.raises(BadList) as caught:
         read_list(home / 'list.csv')
-    assert [line.rpartition('line ')[2].split(';')[0] for line in caught.value.lines] == ['2', '4', '6']
+    assert [line.rpartition('line ')[2].split()[0] for line in caught.value.lines] == ['2', '4', '6']
 
 
 @pytest.mark.parametrize('cells, message', [
