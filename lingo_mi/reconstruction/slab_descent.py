@@ -194,9 +194,11 @@ class DescentSystem(SlabSystem):
     def begin(self, part: int) -> np.ndarray:
         """`tv_floor` of a slab after the sweep, and the square of the length of its change by the sweep."""
         places = self.volume.places
-        swept, _ = self.volume.read_wide(part, 1, places.swept)
-        floor = tv_floor(mi.Float(swept.ravel()), swept.shape)
-        change = mi.Float((self.volume.read(part, places.swept) - self.volume.read(part, places.begun)).ravel())
+        begin, end = self.volume.parts[part]
+        wide, below = self.volume.read_wide(part, 1, places.swept)
+        floor = tv_floor(mi.Float(wide.ravel()), wide.shape)
+        swept = wide[:, :, below : below + end - begin]
+        change = mi.Float((swept - self.volume.read(part, places.begun)).ravel())
         return np.array([floor[0], dot(change, change)])
 
     def squared_gradient(self, part: int, floor: float) -> np.ndarray:
