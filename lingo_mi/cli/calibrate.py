@@ -79,7 +79,7 @@ def main() -> None:
 
 def _inputs(scan: Path) -> list[Path]:
     """The files that a scan is read from, but for those of a folder."""
-    from lingo_mi.files.scans import geometry_file_of, named_files
+    from lingo_mi.files.geometry_file import geometry_file_of, named_files
 
     if scan.suffix != '.npy':
         return [scan]

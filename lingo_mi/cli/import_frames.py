@@ -95,7 +95,8 @@ def chosen_views(text: str | None) -> tuple[int, int | None, int] | None:
 
 def main() -> None:
     args = parser().parse_args()
-    from lingo_mi.files.scans import named_files, write_scan
+    from lingo_mi.files.geometry_file import named_files
+    from lingo_mi.files.scans import write_scan
     from lingo_mi.raw.importing import import_raw
     from lingo_mi.raw.nikon import read_numbers
     from lingo_mi.raw.options import Options

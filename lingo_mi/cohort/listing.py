@@ -14,7 +14,8 @@ from pathlib import Path
 from lingo_mi.cohort.row import COLUMNS, Row, scene_of
 from lingo_mi.common.errors import InputError, printable, shown
 from lingo_mi.common.parsing import MOST_SEED, nearest
-from lingo_mi.files.scans import load_yaml, reader_of
+from lingo_mi.files.geometry_file import load_yaml
+from lingo_mi.files.scans import reader_of
 from lingo_mi.fitting.methods.by_name import known_options
 from lingo_mi.scene.load import defaults
 from lingo_mi.storage.file_access import reading

@@ -9,7 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 from lingo_mi.common.errors import InputError, shown
-from lingo_mi.files import scans
+from lingo_mi.files.geometry_file import geometry_file_of, named_files
 from lingo_mi.fitting.method import Method
 from lingo_mi.fitting.methods.by_name import method_of
 from lingo_mi.scene import outline
@@ -113,7 +113,7 @@ class Row:
         """The files that the geometry names and the numbers depend on."""
         if self.scene is not None:
             return [f for f in outline.scene_files(self.scene, self.parameters) if f.resolve() != self.scene.resolve()]
-        return scans.named_files(Path(self.folder) / self.geometry) if self.geometry else []
+        return named_files(Path(self.folder) / self.geometry) if self.geometry else []
 
 
 def scene_of(folder: Path, geometry: str) -> Path | None:
@@ -141,8 +141,8 @@ def _files(path, geometry):
         return [file for file in path.rglob('*') if file.is_file() and file.name not in SYSTEM]
     if path.suffix.lower() != '.npy' or geometry is not None:
         return [path]
-    beside = scans.geometry_file_of(path)
-    return [path, beside, *scans.named_files(beside)]
+    beside = geometry_file_of(path)
+    return [path, beside, *named_files(beside)]
 
 
 def _digest(files):

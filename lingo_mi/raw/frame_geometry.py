@@ -12,7 +12,7 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.files import scanner_dict
-from lingo_mi.files.scans import load_yaml, posed_geometry, rows_run_up
+from lingo_mi.files.geometry_file import load_yaml, posed_geometry, rows_run_up
 from lingo_mi.geometry import CircularGeometry, CurvedGeometry, Geometry, Grid
 from lingo_mi.geometry.curved import slid
 from lingo_mi.raw.bruker import read_skyscan_log
