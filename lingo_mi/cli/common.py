@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import difflib
 import io
 import os
 import re
@@ -46,9 +47,12 @@ class Parser(argparse.ArgumentParser):
     def parse_args(self, args: Any = None, namespace: Any = None) -> Any:  # type: ignore[override]
         parsed, unknown = self.parse_known_args(args, namespace)
         if unknown:
-            name = unknown[0].partition('=')[0].lstrip('-')  # all options share the dashes
-            near = parsing.nearest(name, (option.lstrip('-') for option in self._option_string_actions))
-            self.error(f'unrecognized arguments: {" ".join(unknown)}{near.replace("mean ", "mean --")}')
+            name = unknown[0].partition('=')[0]
+            # Compared without the dashes, which all options share.
+            options = {option.lstrip('-'): option for option in self._option_string_actions}
+            near = difflib.get_close_matches(name.lstrip('-'), options, 1)
+            hint = f', did you mean {options[near[0]]}?' if near else ''
+            self.error(f'unrecognized arguments: {" ".join(unknown)}{hint}')
         return parsed
 
     def error(self, message: str) -> NoReturn:

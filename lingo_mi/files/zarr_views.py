@@ -25,13 +25,13 @@ class ZarrViews(StoredViews):
     Parameters
     ----------
     path : Path
-        Of the array's folder.
+        Folder of the array.
     shape : tuple of int
-        Of the projections.
+        Shape of the projections.
     numbers : ndarray
-        Of the views in the file.
+        Numbers of the views in the file.
     rows_run_up : bool
-        Whether the file's rows do.
+        Whether the rows of the file run up.
     """
 
     path: Path
@@ -48,7 +48,7 @@ class ZarrViews(StoredViews):
         Raises
         ------
         InputError
-            Which names the file, if it lacks a chunk of them, or a chunk cannot be unpacked or holds NaN.
+            If the file lacks a chunk of them, or a chunk cannot be unpacked or holds NaN. The message names the file.
         """
         numbers, array = self.numbers[index], _opened(self.path)
         _require_chunks(self.path, array, numbers)
@@ -79,7 +79,7 @@ def zarr_views(path: Path, rows_run_up: bool = False) -> ZarrViews:
     Raises
     ------
     InputError
-        If it is damaged, lacks chunks, or is no array of real numbers [n, v, u].
+        If it is damaged, lacks chunks, or is not an array of real numbers [n, v, u].
     """
     path = path.absolute()  # workers have other working directories
     array = _opened(path)
@@ -127,7 +127,7 @@ def _opened(path: Path) -> Any:
 
 
 def _require_chunks(path: Path, array: Any, numbers: np.ndarray) -> None:
-    """Raises InputError where there is no file of a chunk of these views: Zarr would take its values for zero."""
+    """Raises InputError if a chunk of these views has no file, because Zarr would read it as zeros."""
     views, *panel = (int(n) for n in array.chunks)
     across = [range(-(-n // size)) for n, size in zip(array.shape[1:], panel)]
     for chunk in np.unique(np.asarray(numbers) // views):

@@ -17,7 +17,7 @@ from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstructio
 from lingo_mi.reconstruction.fdk import FDK
 from lingo_mi.reconstruction.parameters import LARGE, check_bound, check_counts, check_order, check_range
 from lingo_mi.reconstruction.rectify import can_rectify
-from lingo_mi.reconstruction.sart import passes, sweep
+from lingo_mi.reconstruction.sart import passes, sweep, updates
 from lingo_mi.reconstruction.slab_descent import Changes, DescentPlan
 from lingo_mi.reconstruction.slab_sweeps import swept
 from lingo_mi.reconstruction.system import System, dot, evaluated, norm
@@ -211,9 +211,7 @@ class ASDPOCS(Algorithm):
             raise InputError(
                 'slabs know no corrections of the projector: leave out exact_every, or make the volume whole'
             )
-        order = passes(scan.geometry.angles, self.blocksize, self.OrderStrategy, self.seed)
-        updates = [(self.lmbda * self.lmbda_red**k, views) for k in range(self.niter) for views in next(order)]
-        return DescentPlan(updates, self.noneg, self)
+        return DescentPlan(updates(scan, self), self.noneg, self)
 
     def slab_steps(self, scan: Scan, thickness: int) -> int:
         """The largest number of steps of `slabs`, for `progress`."""

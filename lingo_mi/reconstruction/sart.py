@@ -32,7 +32,7 @@ from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from os import PathLike
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -43,7 +43,7 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.parameters import check_bound, check_counts, check_order, check_range
 from lingo_mi.reconstruction.sart_update import update
-from lingo_mi.reconstruction.slab_sweeps import SweepPlan, swept
+from lingo_mi.reconstruction.slab_sweeps import SweepPlan, Update, swept
 from lingo_mi.reconstruction.system import System, evaluated
 from lingo_mi.reconstruction.wide_pixels import blurred
 from lingo_mi.scan import Scan
@@ -88,6 +88,12 @@ def passes(angles: np.ndarray, blocksize: int, order: str, seed: int) -> Iterato
     blocks(angles, blocksize, order, rng)
     while True:
         yield blocks(angles, blocksize, order, rng)
+
+
+def updates(scan: Scan, how: Any) -> list[Update]:
+    """The relaxation and the views of every update, in order. how: an `OSSART` or `ASDPOCS`, whose options have the same names."""
+    order = passes(scan.geometry.angles, how.blocksize, how.OrderStrategy, how.seed)
+    return [(how.lmbda * how.lmbda_red**k, views) for k in range(how.niter) for views in next(order)]
 
 
 def sweep(
@@ -192,9 +198,7 @@ class Sweeps(Algorithm):
             raise InputError(
                 'slabs do not know the residual of all views: leave out tol, or make the volume without slabs'
             )
-        order = passes(scan.geometry.angles, how.blocksize, how.OrderStrategy, how.seed)
-        updates = [(how.lmbda * how.lmbda_red**k, views) for k in range(how.niter) for views in next(order)]
-        return SweepPlan(updates, how.noneg)
+        return SweepPlan(updates(scan, how), how.noneg)
 
     def slab_steps(self, scan: Scan, thickness: int) -> int:
         """The number of steps of `slabs`, for `progress`."""

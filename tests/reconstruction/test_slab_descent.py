@@ -6,28 +6,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import lingo_mi as lm
+from helpers.slab_scan import slanted_scan
 from lingo_mi.common.errors import InputError
 from lingo_mi.reconstruction import ASDPOCS
 from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.reconstruction.slab_volume import discard
 
-SHAPE = 24, 20, 16
-
 
 @pytest.fixture(scope='module')
 def scan():
-    geometry = lm.Geometry.cone(
-        DSO=300,
-        DSD=450,
-        nDetector=(40, 48),
-        dDetector=4.0,
-        nVoxel=SHAPE,
-        dVoxel=(4.0, 5.0, 6.0),
-        offOrigin=(3.0, -4.0, 5.0),
-        angles=np.linspace(0, 6, 9),
-    )
-    return lm.simulate(np.random.default_rng(0).random(SHAPE, np.float32), geometry, progress=False).train
+    return slanted_scan()
 
 
 def relative(found, whole):

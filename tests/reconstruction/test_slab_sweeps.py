@@ -13,6 +13,7 @@ import pytest
 
 import lingo_mi as lm
 from helpers.script import FIT, SCENE, run
+from helpers.slab_scan import slanted_scan
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.geometry import Grid, PosedGeometry
@@ -23,24 +24,12 @@ from lingo_mi.reconstruction.slab_sweeps import digest_of
 from lingo_mi.reconstruction.slab_volume import discard
 
 RECONSTRUCT = FIT.with_name('reconstruct.py')
-SHAPE = 24, 20, 16
 ALGORITHMS = SART(niter=3), OSSART(niter=3, blocksize=4, noneg=False), SIRT(niter=3)
 
 
 @pytest.fixture(scope='module')
 def scan():
-    """A cone beam that meets the ends of the volume at a slant, with a box of unequal sides off the axis."""
-    geometry = lm.Geometry.cone(
-        DSO=300,
-        DSD=450,
-        nDetector=(40, 48),
-        dDetector=4.0,
-        nVoxel=SHAPE,
-        dVoxel=(4.0, 5.0, 6.0),
-        offOrigin=(3.0, -4.0, 5.0),
-        angles=np.linspace(0, 6, 9),
-    )
-    return lm.simulate(np.random.default_rng(0).random(SHAPE, np.float32), geometry, progress=False).train
+    return slanted_scan()
 
 
 def difference(found, whole):
