@@ -91,7 +91,7 @@ def passes(angles: np.ndarray, blocksize: int, order: str, seed: int) -> Iterato
 
 
 def updates(scan: Scan, how: Any) -> list[Update]:
-    """The relaxation and the views of every update, in order. how: an `OSSART` or `ASDPOCS`, whose options have the same names."""
+    """The relaxation and the views of every update, in order. how: an `OSSART` or `ASDPOCS`."""
     order = passes(scan.geometry.angles, how.blocksize, how.OrderStrategy, how.seed)
     return [(how.lmbda * how.lmbda_red**k, views) for k in range(how.niter) for views in next(order)]
 
