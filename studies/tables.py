@@ -27,7 +27,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser
-from lingo_mi.cli.paper_tables import check_table_arguments, make_tables, table_arguments
+from lingo_mi.cli.paper_tables import PUBLISHED, check_table_arguments, make_tables, table_arguments
 from lingo_mi.common.errors import InputError
 from lingo_mi.common.runtime import use_variant
 from studies.command import run_study
@@ -77,6 +77,10 @@ def main() -> None:
     from lingo_mi.validation.tables.photons import counting
 
     check_table_arguments(args)
+    if args.table in ('ablation', 'controls') and args.methods != list(PUBLISHED):
+        raise InputError(
+            f'--methods has no effect on {args.table}, whose rows are fixed; the table views takes any methods'
+        )
     if args.finer < 1:
         raise InputError(f'--finer must be at least 1, not {args.finer}')
     counting(args.photons, args.electronic_noise)  # checks them

@@ -510,6 +510,7 @@ def test_methods():
         (['ct', '--electronic-noise', '10'], 'needs photons'),
         (['ct', '--photons', '1000', '--longest', 'nan'], '--longest must be above 0'),
         (['scenes'], 'invalid choice'),
+        (['controls', '--methods', 'r2'], '--methods has no effect on controls'),
     ],
 )
 def test_bad_input(args, message, tmp_path):
