@@ -9,9 +9,9 @@ import pytest
 
 if hasattr(os, 'sched_setaffinity'):
     # Processes of pytest-xdist share the cores: threads that wait for each other's cores take a third more time.
-    workers, own = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1')), sorted(os.sched_getaffinity(0))
-    if 1 < workers <= len(own):
-        os.sched_setaffinity(0, own[int(os.environ['PYTEST_XDIST_WORKER'].removeprefix('gw')) :: workers])
+    workers, cpus = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1')), sorted(os.sched_getaffinity(0))
+    if 1 < workers <= len(cpus):
+        os.sched_setaffinity(0, cpus[int(os.environ['PYTEST_XDIST_WORKER'].removeprefix('gw')) :: workers])
 
 import lingo_mi  # noqa: F401 - before any test module loads Dr.Jit, so that Dr.Jit finds the bundled libLLVM
 from helpers.phantoms import made_once

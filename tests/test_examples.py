@@ -41,8 +41,8 @@ def test_there_are_examples():
 def test_example(path, variant, monkeypatch, tmp_path):
     """Without an error, with something to see in each, and without a warning of matplotlib or NumPy."""
     for module in NEEDS.get(path.stem, ()):
-        found = pytest.importorskip(module)
-        if module == 'torch' and variant.startswith('cuda') and not found.cuda.is_available():
+        optional = pytest.importorskip(module)
+        if module == 'torch' and variant.startswith('cuda') and not optional.cuda.is_available():
             pytest.skip('PyTorch has no GPU')
     matplotlib.use('Agg')
     from matplotlib import pyplot
@@ -57,7 +57,7 @@ def test_example(path, variant, monkeypatch, tmp_path):
         names = runpy.run_path(str(path), run_name='__main__')
     lm.use_variant(variant)  # which an example may change
     shown = [names[node.value.id] for node in ast.parse(path.read_text(encoding='utf-8')).body if is_name(node)]
-    assert all('<figure' in display or '<svg' in display for display in (found._repr_html_() for found in shown))
+    assert all('<figure' in display or '<svg' in display for display in (optional._repr_html_() for optional in shown))
     assert shown or pyplot.get_fignums(), 'an example shows something'
     pyplot.close('all')
 

@@ -20,8 +20,8 @@ KINDS = {'.py', '.xml', '.ply', '.cpp', '.json'}
 
 def files(folder: Path) -> set[str]:
     """Paths of the source and data files below a folder, not those that links in it lead to."""
-    found = (path.relative_to(folder) for path in folder.rglob('*') if path.suffix in KINDS and path.is_file())
-    return {path.as_posix() for path in found if not any((folder / p).is_symlink() for p in path.parents)}
+    paths = (path.relative_to(folder) for path in folder.rglob('*') if path.suffix in KINDS and path.is_file())
+    return {path.as_posix() for path in paths if not any((folder / p).is_symlink() for p in path.parents)}
 
 
 @pytest.fixture(scope='module')
@@ -75,9 +75,9 @@ def test_the_citation_has_the_package_version():
 
 def test_zenodo_is_told_what_the_citation_says():
     cited = yaml.safe_load((ROOT / 'CITATION.cff').read_text())
-    told = json.loads((ROOT / '.zenodo.json').read_text())
-    assert told['creators'] == cited['authors'] and 'version' not in told
-    assert {name: told[name] for name in ('title', 'license', 'keywords')} == {
+    deposit = json.loads((ROOT / '.zenodo.json').read_text())
+    assert deposit['creators'] == cited['authors'] and 'version' not in deposit
+    assert {name: deposit[name] for name in ('title', 'license', 'keywords')} == {
         name: cited[name] for name in ('title', 'license', 'keywords')
     }
 

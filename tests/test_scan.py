@@ -94,7 +94,7 @@ def test_views_that_are_none(index):
 
 @pytest.mark.parametrize('index', [[1, 0], [-1], slice(1, None), np.array([0]), [False, True], (1,)])
 def test_views_of_a_scan(index):
-    found = Scan(GEOMETRY, VALUES).subset(index)
+    part = Scan(GEOMETRY, VALUES).subset(index)
     chosen = np.arange(2)[index if isinstance(index, slice) else np.asarray(index)]
-    np.testing.assert_array_equal(found.projections, VALUES[chosen])
-    np.testing.assert_array_equal(found.geometry.angles, GEOMETRY.angles[chosen])
+    np.testing.assert_array_equal(part.projections, VALUES[chosen])
+    np.testing.assert_array_equal(part.geometry.angles, GEOMETRY.angles[chosen])

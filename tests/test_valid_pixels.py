@@ -114,19 +114,19 @@ def test_filtered_backprojection_needs_every_pixel(scan):
 # ---- the initial cloud -------------------------------------------------------------------------------------
 
 
-def brute_force(frames, found, points, misses, outside):
+def brute_force(frames, masked, points, misses, outside):
     """Low valid set by the definition, one point and view at a time."""
     keep = []
     for point in points:
         missed = seen = 0
         for view in range(len(frames)):
             x, y = (q[0] for q in frames.project(point[None], view))
-            inside = 0 <= x < found.low.shape[2] and 0 <= y < found.low.shape[1]
+            inside = 0 <= x < masked.low.shape[2] and 0 <= y < masked.low.shape[1]
             if not inside:
                 missed += outside == 'invalid'
-            elif found.valid[view, int(y), int(x)]:
+            elif masked.valid[view, int(y), int(x)]:
                 seen += 1
-                missed += not found.low[view, int(y), int(x)]
+                missed += not masked.low[view, int(y), int(x)]
         keep.append(missed <= misses and seen > 0)
     return np.flatnonzero(keep)
 
@@ -141,19 +141,19 @@ def brute_force(frames, found, points, misses, outside):
 )
 def test_views_say_nothing_behind_invalid_pixels(scan, outside, misses):
     g, valid = scan.geometry, patches(scan)
-    found = masks(spoilt(scan, valid, 1e9) * g.grid.scale, 0.1, valid)
-    assert not (found.low | found.high)[~valid].any() and found.high[valid].any() and not found.high[valid].all()
+    masked = masks(spoilt(scan, valid, 1e9) * g.grid.scale, 0.1, valid)
+    assert not (masked.low | masked.high)[~valid].any() and masked.high[valid].any() and not masked.high[valid].all()
     expected = masks(np.where(valid, scan.projections, np.nan)[0][valid[0]][None, None] * g.grid.scale, 0.1)
-    assert found.t_high[0] == expected.t_high[0]  # the threshold of the valid pixels alone
+    assert masked.t_high[0] == expected.t_high[0]  # the threshold of the valid pixels alone
     frames, grid = g.normalised_rays(), (8, 8, 8)
-    low, high = valid_voxels(frames, found, grid, g.grid.half, misses, outside)
-    np.testing.assert_array_equal(low, brute_force(frames, found, voxel_centres(grid, g.grid.half), misses, outside))
+    low, high = valid_voxels(frames, masked, grid, g.grid.half, misses, outside)
+    np.testing.assert_array_equal(low, brute_force(frames, masked, voxel_centres(grid, g.grid.half), misses, outside))
     assert len(low) > len(valid_voxels(frames, masks(scan.projections * valid), grid, g.grid.half, misses, outside)[0])
     # Blocks of cells are tested at once on large grids; they must not lose a cell behind an invalid pixel.
     large = (40, 40, 40)
-    whole = valid_voxels(frames, found, large, g.grid.half, misses, outside)[0]
+    whole = valid_voxels(frames, masked, large, g.grid.half, misses, outside)[0]
     sample = np.random.default_rng(0).choice(40**3, 150, replace=False)
-    expected = sample[brute_force(frames, found, voxel_centres(large, g.grid.half, sample), misses, outside)]
+    expected = sample[brute_force(frames, masked, voxel_centres(large, g.grid.half, sample), misses, outside)]
     np.testing.assert_array_equal(np.sort(expected), np.intersect1d(whole, sample))
 
 

@@ -23,12 +23,12 @@ def scan():
 
 @pytest.mark.parametrize('work', [lm.SART(), lm.FDK(), lm.Refined(finer=2), lm.Best()])
 def test_memory_is_what_the_work_is_refused_by(work, scan, monkeypatch):
-    found = lm.estimate(scan.geometry, work)
+    estimate = lm.estimate(scan.geometry, work)
     fine = scan.geometry.on(work.grid(scan.geometry))
-    assert found.memory == memory_needed(work.name, fine, 8) and found.fits and found.seconds is None
-    assert lm.estimate(scan, work).memory == found.memory
-    monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: found.memory - 1)
-    monkeypatch.setattr(module, 'room', lambda: found.memory - 1)
+    assert estimate.memory == memory_needed(work.name, fine, 8) and estimate.fits and estimate.seconds is None
+    assert lm.estimate(scan, work).memory == estimate.memory
+    monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: estimate.memory - 1)
+    monkeypatch.setattr(module, 'room', lambda: estimate.memory - 1)
     assert not lm.estimate(scan, work).fits and 'too much' in repr(lm.estimate(scan, work))
     start = np.zeros((20, 20, 20)) if isinstance(work, lm.Refined) else None
     with pytest.raises(lm.InputError, match='GiB of memory'):
@@ -36,9 +36,9 @@ def test_memory_is_what_the_work_is_refused_by(work, scan, monkeypatch):
 
 
 def test_memory_of_a_fit(scan, monkeypatch):
-    found = lm.estimate(scan, 'fast')
-    assert found.memory == lm.estimate(scan.geometry, lm.Fast()).memory == 4 * (3 * 20**3 + 2 * 8 * 24 * 30)
-    monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: found.memory - 1)
+    estimate = lm.estimate(scan, 'fast')
+    assert estimate.memory == lm.estimate(scan.geometry, lm.Fast()).memory == 4 * (3 * 20**3 + 2 * 8 * 24 * 30)
+    monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: estimate.memory - 1)
     with pytest.raises(lm.InputError, match='GiB of memory'):
         lm.fit(scan, 'fast', progress=False)
 
@@ -57,8 +57,8 @@ def test_a_trial_stops(work, scan):
 
 
 def test_short_work_is_its_own_trial(scan):
-    found = lm.estimate(lm.Dataset(scan), lm.SIRT(niter=2), trial=1000)
-    assert found.seconds[0] == found.seconds[1] > 0
+    estimate = lm.estimate(lm.Dataset(scan), lm.SIRT(niter=2), trial=1000)
+    assert estimate.seconds[0] == estimate.seconds[1] > 0
 
 
 def test_it_is_readable():

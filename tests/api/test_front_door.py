@@ -101,8 +101,8 @@ def test_simulate(data, geometry):
 
 
 def test_simulate_a_scene_and_a_phantom():
-    found = lm.simulate('effects/psf', views=2, parameters=dict(pixels=12, pixel_size=24, voxels=8, voxel_size=16))
-    assert len(found.train) == 2 and found.train.effects is not None
+    actual = lm.simulate('effects/psf', views=2, parameters=dict(pixels=12, pixel_size=24, voxels=8, voxel_size=16))
+    assert len(actual.train) == 2 and actual.train.effects is not None
     plain = lm.simulate(lm.phantom('shepp_logan', size=8), views=3)
     assert len(plain.train) == len(plain.test) == 3 and plain.train.projections.shape[1:] == (512, 512)
 
@@ -230,24 +230,24 @@ def test_a_fit_overwrites_nothing(data, tmp_path, monkeypatch, name):
 
 
 def test_a_reconstruction_is_measured_and_saved(data, tmp_path):
-    found = lm.reconstruct(data, lm.SART(niter=2), progress=False)
-    numbers = found.metrics(data.volume)
+    reconstruction = lm.reconstruct(data, lm.SART(niter=2), progress=False)
+    numbers = reconstruction.metrics(data.volume)
     assert list(numbers) == ['psnr_3d', 'ssim_3d', 'psnr_3d_r2', 'ssim_3d_r2']
-    assert numbers['psnr_3d'] == psnr_3d(found.volume, data.volume) > 10
-    assert found.metrics(found)['psnr_3d'] is None  # infinite
-    path = found.save(tmp_path / 'new' / 'foot.nii.gz')
+    assert numbers['psnr_3d'] == psnr_3d(reconstruction.volume, data.volume) > 10
+    assert reconstruction.metrics(reconstruction)['psnr_3d'] is None  # infinite
+    path = reconstruction.save(tmp_path / 'new' / 'foot.nii.gz')
     stored = read_volume(path)
-    np.testing.assert_array_equal(stored.data, found.volume)
+    np.testing.assert_array_equal(stored.data, reconstruction.volume)
     np.testing.assert_allclose(stored.spacing, data.train.geometry.grid.spacing)
     np.testing.assert_allclose(stored.affine[:3, 3], data.train.geometry.grid.first_voxel)
     with pytest.raises(lm.InputError, match='force=True'):
-        found.save(path)
-    assert found.save(str(path), force=True) == path
+        reconstruction.save(path)
+    assert reconstruction.save(str(path), force=True) == path
     for bad in tmp_path / 'foot.npy', path / 'x.nii', 3:
         with pytest.raises(lm.InputError):
-            found.save(bad)
+            reconstruction.save(bad)
     with pytest.raises(lm.InputError, match='volumes have the shapes'):
-        found.metrics(data.volume[1:])
+        reconstruction.metrics(data.volume[1:])
 
 
 def test_the_cloud_by_function(result, data):
@@ -282,9 +282,9 @@ def test_save_and_load(result, data, tmp_path, request):
     request.getfixturevalue('no_report')
     for copy in tmp_path / 'copy', folder:  # the truth is gone, its numbers are not
         again.save(copy, force=True)
-        kept = lm.load_fit(copy).metrics()
+        copied = lm.load_fit(copy).metrics()
         for name in 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d':
-            assert kept[name] is not None and kept[name] == again.metrics()[name], name
+            assert copied[name] is not None and copied[name] == again.metrics()[name], name
     for damaged in '[]', '{':
         (folder / 'metrics.json').write_text(damaged)
         with pytest.raises(lm.InputError, match='metrics.json: is damaged'):
@@ -423,10 +423,10 @@ def test_a_phantom_on_another_grid_is_its_voxels(change):
     """Also one with exact projections of its own, which are those of its own grid alone."""
     sizes = dict(DSO=1000, DSD=1500, nDetector=(40, 48), dDetector=12, nVoxel=32, angles=circular(3))
     phantom = lm.phantom('shepp_logan', size=32)
-    own = lm.Geometry.cone(**sizes, dVoxel=8.0)
-    exact = lm.simulate(phantom, own, progress=False).train.projections
-    voxels = lm.simulate(phantom.data, own, progress=False).train.projections
+    scan_geometry = lm.Geometry.cone(**sizes, dVoxel=8.0)
+    exact = lm.simulate(phantom, scan_geometry, progress=False).train.projections
+    voxels = lm.simulate(phantom.data, scan_geometry, progress=False).train.projections
     assert 0.01 < np.std(exact - voxels) / exact.max() < 0.1
     other = lm.Geometry.cone(**sizes | dict(dVoxel=8.0) | change)
-    found = lm.simulate(phantom, other, progress=False).train.projections
-    assert_same(found, lm.simulate(phantom.data, other, progress=False).train.projections)
+    projections = lm.simulate(phantom, other, progress=False).train.projections
+    assert_same(projections, lm.simulate(phantom.data, other, progress=False).train.projections)

@@ -61,14 +61,14 @@ def test_axis_and_turn_of_the_panel():
     pixel = geometry.dDetector[1]
     true = Panel(u=-2.4 * pixel, yaw=np.radians(0.8))
     scan = scanned(geometry, data, true)
-    found = lm.calibrate(scan, progress=False)
-    assert in_pixels(found, 'u') == pytest.approx(-2.4, abs=0.05)
-    assert np.degrees(found.found.measured['yaw']) == pytest.approx(0.8, abs=0.04)
-    assert found.found.after < 0.5 * found.found.before
+    calibration = lm.calibrate(scan, progress=False)
+    assert in_pixels(calibration, 'u') == pytest.approx(-2.4, abs=0.05)
+    assert np.degrees(calibration.found.measured['yaw']) == pytest.approx(0.8, abs=0.04)
+    assert calibration.found.after < 0.5 * calibration.found.before
     corner = true.moved(geometry).rays().corner
-    given, mended = (np.abs(s.geometry.rays().corner - corner).max() for s in (scan, found.corrected(scan)))
-    assert mended < 0.05 * given
-    assert len(found.lines()) == 3 and all('not taken' not in line for line in found.lines())
+    before, after = (np.abs(s.geometry.rays().corner - corner).max() for s in (scan, calibration.corrected(scan)))
+    assert after < 0.05 * before
+    assert len(calibration.lines()) == 3 and all('not taken' not in line for line in calibration.lines())
 
 
 @pytest.mark.thorough
@@ -78,15 +78,15 @@ def test_noisy_and_truncated():
     pixel = geometry.dDetector[1]
     scan = scanned(geometry, data, Panel(u=1.7 * pixel))
     cut = np.s_[:, 20:, 16:-16]
-    told = replace(geometry, nDetector=(60, PIXELS - 32), offDetector=(-10 * geometry.dDetector[0], 0))
+    shifted = replace(geometry, nDetector=(60, PIXELS - 32), offDetector=(-10 * geometry.dDetector[0], 0))
     p = scan.projections[cut]
     assert (p[:, :, [0, -1]] > 0.2 * p.max()).any() and (p[:, 0] > 0.2 * p.max()).any()
     p = p + np.random.default_rng(0).normal(0, 0.01 * p.max(), p.shape)
-    found = lm.calibrate(lm.Scan(told, p), progress=False)
-    assert in_pixels(found, 'u') == pytest.approx(1.7, abs=0.1)
+    calibration = lm.calibrate(lm.Scan(shifted, p), progress=False)
+    assert in_pixels(calibration, 'u') == pytest.approx(1.7, abs=0.1)
 
 
-def row_scan(mode, views, total, columns, told=0.0, true=0.0, width=1.4):
+def row_scan(mode, views, total, columns, stated=0.0, true=0.0, width=1.4):
     """One row of the foot; the panel's width is that many sides of the object at the axis. Places in columns from the foot of the
     axis."""
     phantom = lm.phantom('foot', SIZE)
@@ -99,15 +99,15 @@ def row_scan(mode, views, total, columns, told=0.0, true=0.0, width=1.4):
         nVoxel=(SIZE, SIZE, 1),
         dVoxel=phantom.spacing,
         angles=circular(views, total),
-        offDetector=(0, told * pixel),
+        offDetector=(0, stated * pixel),
     )
     sizes |= dict(DSO=4 * side, DSD=6 * side) if mode == 'cone' else {}
     geometry = getattr(lm.Geometry, mode)(**sizes)
-    return scanned(geometry, data, Panel(u=(true - told) * pixel))
+    return scanned(geometry, data, Panel(u=(true - stated) * pixel))
 
 
 @pytest.mark.parametrize(
-    ('mode', 'width', 'told', 'true'),
+    ('mode', 'width', 'stated', 'true'),
     [
         pytest.param('parallel', 0.63, -20, -22, marks=pytest.mark.thorough),  # half a fan
         pytest.param('cone', 0.84, -20, -22, marks=pytest.mark.thorough),
@@ -116,14 +116,14 @@ def row_scan(mode, views, total, columns, told=0.0, true=0.0, width=1.4):
         ('parallel', 3.6, 0, 22),  # far off
     ],
 )
-def test_an_axis_of_objects_that_are_cut_and_one_far_off(mode, width, told, true):
+def test_an_axis_of_objects_that_are_cut_and_one_far_off(mode, width, stated, true):
     """To a twentieth of a pixel, and to three standard errors."""
-    scan = row_scan(mode, 180, 360, 64, told, true, width)
-    found = lm.calibrate(scan, progress=False)
-    right, pixel = true - told, scan.geometry.dDetector[1]
-    assert in_pixels(found, 'u') == pytest.approx(right, abs=0.05)
-    assert abs(in_pixels(found, 'u') - right) < 3 * found.found.errors['u'] / pixel
-    taken = found.found.drift.u[0] / pixel
+    scan = row_scan(mode, 180, 360, 64, stated, true, width)
+    calibration = lm.calibrate(scan, progress=False)
+    right, pixel = true - stated, scan.geometry.dDetector[1]
+    assert in_pixels(calibration, 'u') == pytest.approx(right, abs=0.05)
+    assert abs(in_pixels(calibration, 'u') - right) < 3 * calibration.found.errors['u'] / pixel
+    taken = calibration.found.drift.u[0] / pixel
     assert taken == (pytest.approx(right, abs=0.05) if right else 0)
 
 
@@ -132,9 +132,9 @@ def test_an_object_that_is_cut_turns_no_panel():
     """On both sides, of a cone beam: neither shift nor turn, whose errors are told."""
     geometry, data = scanner(24, rows=40)
     geometry = replace(geometry, nDetector=(32, 32))
-    found = lm.calibrate(scanned(geometry, data, Panel()), progress=False)
-    assert not found.needed and abs(in_pixels(found, 'u')) < 0.05
-    assert any('no edge of the panel shows air' in line for line in found.lines())
+    calibration = lm.calibrate(scanned(geometry, data, Panel()), progress=False)
+    assert not calibration.needed and abs(in_pixels(calibration, 'u')) < 0.05
+    assert any('no edge of the panel shows air' in line for line in calibration.lines())
 
 
 @pytest.mark.parametrize('tilt', [pytest.param(0.0, marks=pytest.mark.thorough), 0.01])
@@ -146,12 +146,12 @@ def test_a_drift_of_the_beam_is_no_geometry(tilt):
     p = ideal.projections / ideal.projections.max()
     slope = 0.02 + tilt * np.linspace(-1, 1, 40)[:, None] + tilt * np.linspace(-1, 1, 36)
     scan = lm.Scan(geometry, p + np.linspace(-1, 1, 24)[:, None, None] * slope)
-    found = lm.calibrate(scan, progress=False)
-    drift = found.found.drift
-    assert (drift.u[0], drift.yaw) == (0, 0) and abs(np.degrees(found.found.measured['yaw'])) < 0.03
-    assert found.lines()[0].startswith('air beside the object: ') and found.needed
-    np.testing.assert_allclose(found.corrected(scan).projections, p, atol=0.002)
-    np.testing.assert_allclose(found.corrected(scan.subset([3, 9])).projections, p[[3, 9]], atol=0.002)
+    calibration = lm.calibrate(scan, progress=False)
+    drift = calibration.found.drift
+    assert (drift.u[0], drift.yaw) == (0, 0) and abs(np.degrees(calibration.found.measured['yaw'])) < 0.03
+    assert calibration.lines()[0].startswith('air beside the object: ') and calibration.needed
+    np.testing.assert_allclose(calibration.corrected(scan).projections, p, atol=0.002)
+    np.testing.assert_allclose(calibration.corrected(scan.subset([3, 9])).projections, p[[3, 9]], atol=0.002)
 
 
 def test_drift_is_found_and_held_out_views_get_theirs():
@@ -161,10 +161,10 @@ def test_drift_is_found_and_held_out_views_get_theirs():
     true = Drift.of(geometry, dict(u=0.8 * pixel, u1=0.6 * pixel, v1=-0.3 * pixel))
     every = scanned(geometry, data, true.panel(geometry))
     dataset = lm.Dataset(every.subset(slice(0, None, 2)), every.subset(slice(1, None, 2)))
-    found = lm.calibrate(dataset, drift=1, progress=False)
-    mended = found.corrected(dataset)
+    calibration = lm.calibrate(dataset, drift=1, progress=False)
+    corrected = calibration.corrected(dataset)
     right = true.panel(geometry).moved(geometry).rays().corner
-    for scan, part in ((mended.train, slice(0, None, 2)), (mended.test, slice(1, None, 2))):
+    for scan, part in ((corrected.train, slice(0, None, 2)), (corrected.test, slice(1, None, 2))):
         error = scan.geometry.rays().corner - right[part]
         error -= error.mean(0) * [0, 0, 1]  # the height is not told
         assert np.linalg.norm(error, axis=1).max() < 0.1 * pixel
@@ -174,18 +174,18 @@ def test_drift_is_found_and_held_out_views_get_theirs():
 def test_a_sound_scan_is_left_as_it_is():
     geometry, data = scanner(30)
     scan = scanned(geometry, data, Panel())
-    found = lm.calibrate(scan, progress=False)
-    assert not found.needed and found.corrected(scan) is scan
-    assert all('not taken' in line for line in found.lines()[:-1])
+    calibration = lm.calibrate(scan, progress=False)
+    assert not calibration.needed and calibration.corrected(scan) is scan
+    assert all('not taken' in line for line in calibration.lines()[:-1])
 
 
 @pytest.mark.parametrize('mode', ['cone', pytest.param('parallel', marks=pytest.mark.slow)])
 def test_one_row(mode):
     geometry, data = scanner(40, mode=mode, flat=True)
     pixel = geometry.dDetector[1]
-    found = lm.calibrate(scanned(geometry, data, Panel(u=3.3 * pixel)), progress=False)
-    assert list(found.found.measured) == ['u']
-    assert in_pixels(found, 'u') == pytest.approx(3.3, abs=0.05)
+    calibration = lm.calibrate(scanned(geometry, data, Panel(u=3.3 * pixel)), progress=False)
+    assert list(calibration.found.measured) == ['u']
+    assert in_pixels(calibration, 'u') == pytest.approx(3.3, abs=0.05)
 
 
 def responding(numbers, **parts):
@@ -201,9 +201,9 @@ def responding(numbers, **parts):
 def test_curve_of_the_detector():
     """A fifth of the highest line integral is missing: three quarters of the error go, and a coefficient is told to 0.03."""
     scan, p = responding({'curve0': -0.08}, curve=1)
-    found = lm.calibrate(scan, curve=1, progress=False)
-    assert found.found.measured['curve0'] == pytest.approx(-0.08, abs=0.03)
-    assert np.std(found.corrected(scan).projections - p) < 0.3 * np.std(scan.projections - p)
+    calibration = lm.calibrate(scan, curve=1, progress=False)
+    assert calibration.found.measured['curve0'] == pytest.approx(-0.08, abs=0.03)
+    assert np.std(calibration.corrected(scan).projections - p) < 0.3 * np.std(scan.projections - p)
 
 
 @pytest.mark.thorough
@@ -211,29 +211,30 @@ def test_gain_over_time():
     """A gain that falls and rises by 4 %: its polynomials to 0.01."""
     true = dict(gain1=-0.02, gain2=0.02, gain3=0.0)
     scan, p = responding(true, gain='smooth')
-    found = lm.calibrate(scan, gain=True, progress=False)
-    assert {name: found.found.measured[name] for name in true} == pytest.approx(true, abs=0.01)
-    assert np.std(found.corrected(scan).projections - p) < 0.5 * np.std(scan.projections - p)
+    calibration = lm.calibrate(scan, gain=True, progress=False)
+    assert {name: calibration.found.measured[name] for name in true} == pytest.approx(true, abs=0.01)
+    assert np.std(calibration.corrected(scan).projections - p) < 0.5 * np.std(scan.projections - p)
 
 
 @pytest.mark.thorough
 def test_scattered_light_is_not_negative():
     """Light that is missing, most of it in the panel's middle, is no scatter: the scan stays as it is, and the lines say why."""
     scan, _ = responding({'scatter0_0': -0.02, 'scatter0_3': 0.01}, scatter='one')
-    found = lm.calibrate(scan, scatter=True, progress=False)
-    assert found.found.measured['scatter0_0'] < -0.01 and not found.found.response.parts[0].values.any()
-    told = [line for line in found.lines() if 'scatter' in line]
-    assert len(told) == 6 and all(', not taken: it ' in line for line in told)
-    assert 'negative in places' in told[0] and 'negative in places' in told[3]
+    calibration = lm.calibrate(scan, scatter=True, progress=False)
+    assert calibration.found.measured['scatter0_0'] < -0.01 and not calibration.found.response.parts[0].values.any()
+    scatter_lines = [line for line in calibration.lines() if 'scatter' in line]
+    assert len(scatter_lines) == 6 and all(', not taken: it ' in line for line in scatter_lines)
+    assert 'negative in places' in scatter_lines[0] and 'negative in places' in scatter_lines[3]
 
 
 @pytest.mark.thorough
 def test_a_slope_of_scattered_light_alone_is_not_taken():
     """Its mean is not told, so it is taken for 0; half of what is left would be negative."""
     scan, _ = responding({'scatter0_1': 0.02}, scatter='one')
-    found = lm.calibrate(scan, scatter=True, progress=False).found
+    search = lm.calibrate(scan, scatter=True, progress=False).found
     assert (
-        abs(found.measured['scatter0_1']) > 5 * found.errors['scatter0_1'] and not found.response.parts[0].values.any()
+        abs(search.measured['scatter0_1']) > 5 * search.errors['scatter0_1']
+        and not search.response.parts[0].values.any()
     )
 
 
@@ -241,12 +242,12 @@ def test_a_slope_of_scattered_light_alone_is_not_taken():
 def test_air_and_scatter():
     """Air to 0.01, scatter to a hundredth of the open beam."""
     scan, _ = responding({'air0': 0.05, 'air1': 0.03}, air='smooth')
-    found = lm.calibrate(scan, air=True, progress=False).found.measured
-    assert (found['air0'], found['air1']) == pytest.approx((0.05, 0.03), abs=0.01)
+    search = lm.calibrate(scan, air=True, progress=False).found.measured
+    assert (search['air0'], search['air1']) == pytest.approx((0.05, 0.03), abs=0.01)
     scan, _ = responding({'scatter0_0': 0.03}, scatter='one')
-    found = lm.calibrate(scan, scatter=True, progress=False).found
-    assert found.measured['scatter0_0'] == pytest.approx(0.03, abs=0.01)
-    assert 'scatter0_0' not in found.refused and found.response.parts[0].values[0, 0] > 0.02
+    search = lm.calibrate(scan, scatter=True, progress=False).found
+    assert search.measured['scatter0_0'] == pytest.approx(0.03, abs=0.01)
+    assert 'scatter0_0' not in search.refused and search.response.parts[0].values[0, 0] > 0.02
 
 
 @pytest.mark.slow
@@ -254,12 +255,12 @@ def test_parallel_and_posed():
     geometry, data = scanner(24, mode='parallel')
     pixel = geometry.dDetector[1]
     true = Panel(u=1.3 * pixel, yaw=np.radians(-0.7))
-    found = lm.calibrate(scanned(geometry, data, true), progress=False)
-    assert in_pixels(found, 'u') == pytest.approx(1.3, abs=0.05)
-    assert np.degrees(found.found.measured['yaw']) == pytest.approx(-0.7, abs=0.05)
+    calibration = lm.calibrate(scanned(geometry, data, true), progress=False)
+    assert in_pixels(calibration, 'u') == pytest.approx(1.3, abs=0.05)
+    assert np.degrees(calibration.found.measured['yaw']) == pytest.approx(-0.7, abs=0.05)
     posed = Panel(u=-1.1 * pixel).moved(true.moved(geometry))
-    found = lm.calibrate(lm.Scan(posed, scanned(geometry, data, true).projections), progress=False)
-    assert in_pixels(found, 'u') == pytest.approx(1.1, abs=0.05)
+    calibration = lm.calibrate(lm.Scan(posed, scanned(geometry, data, true).projections), progress=False)
+    assert in_pixels(calibration, 'u') == pytest.approx(1.1, abs=0.05)
 
 
 def test_times_of_views():
@@ -280,9 +281,9 @@ def test_times_of_several_turns(total):
     geometry, _ = scanner(10)
     counted = replace(geometry, angles=circular(48, total))
     for scan in (counted, replace(counted, angles=np.mod(counted.angles, 2 * np.pi))):
-        own = np.linspace(-1, 1, 48)
-        np.testing.assert_allclose(scan_times(scan, scan.angles), own, atol=1e-9)
-        np.testing.assert_allclose(scan_times(scan, scan.angles[1::3]), own[1::3], atol=1e-6)
+        expected = np.linspace(-1, 1, 48)
+        np.testing.assert_allclose(scan_times(scan, scan.angles), expected, atol=1e-9)
+        np.testing.assert_allclose(scan_times(scan, scan.angles[1::3]), expected[1::3], atol=1e-6)
 
 
 def test_pixels_that_are_not_valid_leave_the_others():
@@ -331,8 +332,8 @@ def test_a_response_that_was_not_found_leaves_the_effects():
     scan = lm.Scan(geometry, grid.project_volume(data, geometry), effects=effects)
     response = Response.of(geometry, air='smooth')
     drift = Drift(geometry, u=(0.5,), v=(0.3,))
-    found = SearchResult(drift, response, dict(u=0.5, v=0.3), dict(u=0.01, v=0.01), {}, 1.0, 0.5)
-    calibration = Calibration(geometry, found)
+    search = SearchResult(drift, response, dict(u=0.5, v=0.3), dict(u=0.01, v=0.01), {}, 1.0, 0.5)
+    calibration = Calibration(geometry, search)
     moved = calibration.corrected(scan)
     assert moved.effects is effects and moved.geometry != geometry
     np.testing.assert_array_equal(moved.projections, scan.projections)

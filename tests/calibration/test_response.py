@@ -56,14 +56,14 @@ def test_derivatives_by_differences():
     for part in response.parts:
         c = part.values[0] + (0.01 if part.name == 'scatter' else 0)
         by_numbers, by_p = part.slopes(p[0], c, place)
-        for k, found in enumerate(by_numbers):
+        for k, actual in enumerate(by_numbers):
             e = h * np.eye(len(c))[k]
             np.testing.assert_allclose(
-                found, (part.apply(p[0], c + e, place) - part.apply(p[0], c - e, place)) / (2 * h), atol=1e-5
+                actual, (part.apply(p[0], c + e, place) - part.apply(p[0], c - e, place)) / (2 * h), atol=1e-5
             )
         inside = np.abs(p[0] - h) > 2 * h  # the curve has a corner in its slope at 0
-        found = (part.apply(p[0] + h, c, place) - part.apply(p[0] - h, c, place)) / (2 * h)
-        np.testing.assert_allclose(by_p[inside], found[inside], atol=1e-4)
+        actual = (part.apply(p[0] + h, c, place) - part.apply(p[0] - h, c, place)) / (2 * h)
+        np.testing.assert_allclose(by_p[inside], actual[inside], atol=1e-4)
 
 
 def test_negative_light_is_doubted_beyond_three_standard_errors():
@@ -89,11 +89,11 @@ def test_numbers_are_found(parts, within):
     """From views with noise of 0.003: air to 0.0005, gain to 0.2 %, scatter to a thousandth of the open beam."""
     true, p = drawn(**parts)
     measured = true.applied(p, GEOMETRY) + np.random.default_rng(1).normal(0, 0.003, p.shape).astype(np.float32)
-    found = Response.of(GEOMETRY, highest=float(p.max()), **parts)
-    found.fit(p, measured)
-    for a, b in zip(found.parts, true.parts):
+    response = Response.of(GEOMETRY, highest=float(p.max()), **parts)
+    response.fit(p, measured)
+    for a, b in zip(response.parts, true.parts):
         assert np.abs(a.values - b.values).max() < within[a.name], a.name
-    assert np.std(measured - found.applied(p, GEOMETRY)) < 0.0031
+    assert np.std(measured - response.applied(p, GEOMETRY)) < 0.0031
     assert np.std(measured - p) > 0.006
 
 
@@ -103,9 +103,9 @@ def test_invalid_pixels_and_outliers_are_left_alone():
     valid = np.ones(p.shape, bool)
     valid[:, :6], measured[:, :6] = False, 100
     measured[:, 10, 4] += 5  # a pixel that nobody has noticed
-    found = Response.of(GEOMETRY, air='view')
-    found.fit(p, measured, valid)
-    assert np.abs(found.parts[0].values - true.parts[0].values).max() < 1e-3
+    response = Response.of(GEOMETRY, air='view')
+    response.fit(p, measured, valid)
+    assert np.abs(response.parts[0].values - true.parts[0].values).max() < 1e-3
 
 
 def test_views_between_get_numbers_between():
@@ -131,7 +131,7 @@ def test_checkpoint_and_report():
     response, _ = drawn(**ALL)
     again = Response.of(GEOMETRY, highest=float(expected().max()), **ALL)
     again.restore(response.arrays())
-    found = again.report()
-    assert found == response.report() and len(found['air_level']) == VIEWS == len(found['gain_percent'])
-    assert len(found['hardening_percent_at_highest']) == 1 and found['scatter_percent_of_open_beam'][0] > 0
+    actual = again.report()
+    assert actual == response.report() and len(actual['air_level']) == VIEWS == len(actual['gain_percent'])
+    assert len(actual['hardening_percent_at_highest']) == 1 and actual['scatter_percent_of_open_beam'][0] > 0
     assert Response.of(GEOMETRY) is None

@@ -389,5 +389,5 @@ def test_a_folder_of_raw_frames_names_import(tmp_path):
     (tmp_path / 'frames').mkdir()
     for i in range(3):
         (tmp_path / 'frames' / f'{i}.tif').write_bytes(b'II')
-    said = refused(tmp_path, tmp_path / 'frames')
-    assert 'holds raw frames; make a scan of them: lingo-mi import' in said
+    message = refused(tmp_path, tmp_path / 'frames')
+    assert 'holds raw frames; make a scan of them: lingo-mi import' in message

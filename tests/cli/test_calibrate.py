@@ -33,9 +33,9 @@ def test_the_axis_is_found_and_written(fan, monkeypatch, capsys):
     out = fan.with_name('mended.npy')
     run(monkeypatch, fan, '--out', out)
     assert 'shift of the panel along u: -' in capsys.readouterr().out
-    given, mended = read_scan(fan).train, read_scan(out).train
-    assert mended.geometry.offDetector[1] == pytest.approx(-4.0, abs=0.2)
-    np.testing.assert_array_equal(mended.projections, given.projections)
+    before, after = read_scan(fan).train, read_scan(out).train
+    assert after.geometry.offDetector[1] == pytest.approx(-4.0, abs=0.2)
+    np.testing.assert_array_equal(after.projections, before.projections)
     assert 'calibrated_from: scan.npy' in out.with_suffix('.yml').read_text()
 
 

@@ -207,8 +207,8 @@ def test_scans_a_volume(scene, dataset, tmp_path):
 
 @pytest.mark.parametrize('kind, name, held_out', [('naf', 'scan.pickle', 3), ('r2', 'scan', 3), ('npy', 'scan.npy', 0)])
 def test_measured_projections(scene, dataset, tmp_path, kind, name, held_out):
-    given = dataset if held_out else replace(dataset, test=None, volume=None)
-    write_scan(tmp_path / name, given, kind)
+    stored = dataset if held_out else replace(dataset, test=None, volume=None)
+    write_scan(tmp_path / name, stored, kind)
     code, _, err = fit(scene, *QUICK, '--out', tmp_path / 'a', '--projections', tmp_path / name)
     assert code == 0, err
     metrics = metrics_of(tmp_path / 'a')

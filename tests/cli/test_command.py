@@ -55,10 +55,10 @@ def test_an_example_of_the_help_parses(name):
 
 def test_version(command):
     code, out, err = command('--version')
-    found = dict(line.split(maxsplit=1) for line in out.splitlines())
-    assert code == 0 and not err and found['lingo_mi'] == version('lingo_mi')
-    assert found['numpy'] == np.__version__ and found['Python'] == platform.python_version()
-    assert 'llvm_ad_mono' in found['variants'] and found['LLVM'].split('.')[0].isdigit()
+    versions = dict(line.split(maxsplit=1) for line in out.splitlines())
+    assert code == 0 and not err and versions['lingo_mi'] == version('lingo_mi')
+    assert versions['numpy'] == np.__version__ and versions['Python'] == platform.python_version()
+    assert 'llvm_ad_mono' in versions['variants'] and versions['LLVM'].split('.')[0].isdigit()
 
 
 def test_completion(command):

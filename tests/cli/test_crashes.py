@@ -73,8 +73,8 @@ class Bench:
         for seed, command in self.seeds.items():
             self.box.mkdir(exist_ok=True)
             self.go('fit', command)
-            shutil.move(self.out, self.kept(seed))
-            self.metrics[seed] = json.loads((self.kept(seed) / METRICS).read_text())
+            shutil.move(self.out, self.reference(seed))
+            self.metrics[seed] = json.loads((self.reference(seed) / METRICS).read_text())
         assert abs(self.metrics[0]['psnr_2d'] - self.metrics[1]['psnr_2d']) > 0.01, 'the test could not tell them apart'
         self.fdk = [self.scene, '--algorithm', 'fdk', '--out', self.volume, '-D', 'views=7', '--force']
         self.table = [
@@ -99,7 +99,7 @@ class Bench:
     def fit(self, seed, *more):
         return [self.scene, *FIT, '--seed', seed, '--out', self.out, *more]
 
-    def kept(self, seed):
+    def reference(self, seed):
         return self.home / f'seed_{seed}'
 
     def go(self, task, arguments):
@@ -116,7 +116,7 @@ class Bench:
     def old_result(self):
         """A result of seed 0 and files of somebody else."""
         self.empty()
-        shutil.copytree(self.kept(0), self.out)
+        shutil.copytree(self.reference(0), self.out)
         for name in MINE:
             (self.out / name).write_text('mine')
 
@@ -135,15 +135,15 @@ class Bench:
 
     def require_whole(self, seeds):
         """metrics.json tells of the files as they are, and of one of these fits; the view files are its own."""
-        found = json.loads((self.out / METRICS).read_text())
-        assert {'result.xml', 'gaussians.ply', 'volume.nii.gz', 'report.html', CHECKPOINT} <= found['files'].keys()
-        for name, value in found['files'].items():
+        record = json.loads((self.out / METRICS).read_text())
+        assert {'result.xml', 'gaussians.ply', 'volume.nii.gz', 'report.html', CHECKPOINT} <= record['files'].keys()
+        for name, value in record['files'].items():
             assert digest(self.out / name) == value, name
-        assert any(self.same(found, self.metrics[seed]) for seed in seeds), {k: found[k] for k in KEYS}
+        assert any(self.same(record, self.metrics[seed]) for seed in seeds), {k: record[k] for k in KEYS}
 
     @staticmethod
-    def same(found, wanted):
-        return all(found[k] == pytest.approx(wanted[k], rel=1e-4) for k in KEYS)
+    def same(actual, wanted):
+        return all(actual[k] == pytest.approx(wanted[k], rel=1e-4) for k in KEYS)
 
     def require_result(self, seeds, empty=False):
         """A whole result of one of these seeds, or a checkpoint of it; or nothing, where there was nothing."""
@@ -169,8 +169,8 @@ class Bench:
         assert left == {'.lingo_mi.json'}, left
 
     def require_volume(self):
-        found = read_volume(self.volume).data
-        assert any(np.allclose(found, wanted, atol=1e-6) for wanted in (self.before, self.new_volume))
+        volume = read_volume(self.volume).data
+        assert any(np.allclose(volume, wanted, atol=1e-6) for wanted in (self.before, self.new_volume))
         assert np.load(self.box / 'mine.npy') == [1]
 
     def require_table(self):
@@ -194,7 +194,7 @@ class Bench:
             Case('fit', 'fit', self.seeds[1], self.empty, lambda: self.require_result([1], empty=True)),
             Case('force', 'fit', self.fit(1, '--force'), self.old_result, lambda: self.require_result([0, 1])),
             Case('resume', 'fit', self.fit(1, '--resume'), self.half_a_fit, lambda: self.require_result([1])),
-            Case('save', 'save', [self.kept(1), self.out], self.old_result, lambda: self.require_result([0, 1])),
+            Case('save', 'save', [self.reference(1), self.out], self.old_result, lambda: self.require_result([0, 1])),
             Case('reconstruct', 'reconstruct', self.fdk, self.old_volume, self.require_volume),
             Case('tables', 'tables', self.table, self.empty, self.require_table),
         ]
@@ -218,8 +218,11 @@ class Bench:
         elif kind == 'kill':
             assert code == -signal.SIGKILL
         else:
-            said = [line for line in err.splitlines() if line.startswith('error: ')]
-            assert code == 2 and len(said) == 1 and 'Traceback' not in err and len(said[0]) < 308, (code, err)
+            error_lines = [line for line in err.splitlines() if line.startswith('error: ')]
+            assert code == 2 and len(error_lines) == 1 and 'Traceback' not in err and len(error_lines[0]) < 308, (
+                code,
+                err,
+            )
         case.accept()
 
 

@@ -55,9 +55,9 @@ def understood(monkeypatch, capsys):
 def check_all(text, understood):
     for words in commands_in(text):
         args = understood(words)
-        known = _settings(args) if getattr(args, 'define', None) else set()
+        settings = _settings(args) if getattr(args, 'define', None) else set()
         for name in (pair.partition('=')[0] for pair in getattr(args, 'define', None) or []):
-            assert name in known, f'{shlex.join(words)}: -D {name} is unknown'
+            assert name in settings, f'{shlex.join(words)}: -D {name} is unknown'
 
 
 @pytest.mark.parametrize('page', PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())

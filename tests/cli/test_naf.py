@@ -61,9 +61,9 @@ def test_files_and_summary(fitted):
 def test_mitsuba_sees_the_field_as_voxels(fitted):
     """result.xml, through the integrator, gives the projections of volume.nii.gz."""
     folder, _ = fitted
-    found = take_scan(load_scene(folder / 'result.xml')).train
+    taken_scan = take_scan(load_scene(folder / 'result.xml')).train
     volume = nibabel.load(folder / 'volume.nii.gz').get_fdata().astype(np.float32)
-    np.testing.assert_allclose(found.projections, grid.project_volume(volume, found.geometry), atol=1e-4)
+    np.testing.assert_allclose(taken_scan.projections, grid.project_volume(volume, taken_scan.geometry), atol=1e-4)
 
 
 def test_the_result_is_read_again(fitted):
@@ -89,32 +89,32 @@ def test_a_finished_fit_goes_on_to_the_same_result(fitted, scene):
 def test_completed_views_and_the_fields_volume(fitted, scene, tmp_path, algorithm):
     checkpoint, out = fitted[0] / 'checkpoint.npz', tmp_path / 'volume.nii.gz'
     views = [] if algorithm == 'voxelize' else ['--views', '8']
-    code, said, err = run(RECONSTRUCT, scene, '--algorithm', algorithm, '--complete', checkpoint, *views, '--out', out)
+    code, text, err = run(RECONSTRUCT, scene, '--algorithm', algorithm, '--complete', checkpoint, *views, '--out', out)
     assert code == 0, err
     volume = nibabel.load(out).get_fdata()
     if algorithm == 'voxelize':
         np.testing.assert_allclose(volume, lm.load_fit(fitted[0]).volume(), rtol=1e-6, atol=1e-9)
-    assert float(said.split('PSNR ')[1].split()[0]) > 18
+    assert float(text.split('PSNR ')[1].split()[0]) > 18
 
 
 def test_a_reconstruction_starts_from_the_field(fitted, scene, tmp_path):
     checkpoint, out = fitted[0] / 'checkpoint.npz', tmp_path / 'volume.nii.gz'
-    code, said, err = run(
+    code, text, err = run(
         RECONSTRUCT, scene, '--algorithm', 'sart', '--start', checkpoint, '-D', 'niter=2', '--out', out
     )
     assert code == 0, err
-    assert float(said.split('PSNR ')[1].split()[0]) > 18
+    assert float(text.split('PSNR ')[1].split()[0]) > 18
 
 
 def test_what_a_field_cannot_do_is_one_line(fitted, scene, tmp_path):
-    for changes, said in (
+    for changes, message in (
         (['-D', 'lambda_tv=0.1'], 'lambda_tv: neither'),
         (['-D', 'rate_pose=1e-3,1e-4'], 'rate_pose'),
         (['--start', 'masks'], "'start'"),
         (['-D', 'field_samples=0'], 'field_samples'),
     ):
         code, _, err = fit(scene, '--method', 'naf', *changes, '--out', tmp_path / 'out')
-        assert code == 2 and said in err and err.count('\n') == 1, err
+        assert code == 2 and message in err and err.count('\n') == 1, err
         assert not (tmp_path / 'out').exists()
     code, _, err = fit(scene, '--start', 'network', '--out', tmp_path / 'out')
     assert code == 2 and "'masks'" in err and "not 'network'" in err

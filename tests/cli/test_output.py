@@ -200,7 +200,7 @@ def test_no_result_depends_on_a_name(scene, tmp_path, name):
     """Of a volume and of the folder: what is written is written, and shown as text."""
     volume, out = tmp_path / os.fsdecode(name + b'.nii.gz'), tmp_path / os.fsdecode(name)
     write_volume(volume, np.random.default_rng(0).random((12, 12, 12)), Grid(12, 1))
-    code, said, err = fit(scene, *QUICK, '--volume', volume, '--out', out, report=True)
+    code, text, err = fit(scene, *QUICK, '--volume', volume, '--out', out, report=True)
     assert code == 0 and 'warning' not in err, err
     page = (out / 'report.html').read_text(encoding='utf-8')
     assert '<script>alert' not in page and {'metrics.json', 'report.png'} <= {p.name for p in out.iterdir()}

@@ -99,11 +99,11 @@ def test_best(scene, dataset, tmp_path):
     code, text, err = run(RECONSTRUCT, *command, '--report', tmp_path / 'v.html')
     assert '"name":"Error map"' in (page := (tmp_path / 'v.html').read_text()) and 'v.nii.gz' in page
     assert code == 0 and 'best of 8 views' in text and '(100%)' in err, err
-    found = run_algorithm(dataset.train, Best(niter=2, finer=1))
-    np.testing.assert_array_equal(load(out), found.volume)
-    np.testing.assert_array_equal(load(error), found.error)
-    assert found.report() in text
-    assert json.loads(plan.read_text())['tried'] == found.record()['tried']
+    result = run_algorithm(dataset.train, Best(niter=2, finer=1))
+    np.testing.assert_array_equal(load(out), result.volume)
+    np.testing.assert_array_equal(load(error), result.error)
+    assert result.report() in text
+    assert json.loads(plan.read_text())['tried'] == result.record()['tried']
     out.unlink()  # what is beside it is not replaced either
     code, _, err = run(RECONSTRUCT, *command)
     assert code == 2 and 'v-plan.json: exists already' in err and not out.exists()
@@ -178,9 +178,9 @@ def test_start(scene, dataset, fitted, tmp_path):
     assert code == 0 and 'of 4 views' in text, err
     cloud = load_fit(fitted)
     scan = fitted_views(dataset.train, cloud.nominal_geometry)
-    own = cloud.volume(scan.geometry.grid)
-    assert_same_volume(load(tmp_path / 'v.nii'), run_algorithm(scan, SART(3), start=own).volume)
-    assert psnr_3d_r2(load(tmp_path / 'v.nii'), dataset.volume) > psnr_3d_r2(own, dataset.volume) + 0.5
+    cloud_volume = cloud.volume(scan.geometry.grid)
+    assert_same_volume(load(tmp_path / 'v.nii'), run_algorithm(scan, SART(3), start=cloud_volume).volume)
+    assert psnr_3d_r2(load(tmp_path / 'v.nii'), dataset.volume) > psnr_3d_r2(cloud_volume, dataset.volume) + 0.5
 
 
 def test_refined(scene, dataset, fitted, tmp_path):
@@ -202,13 +202,15 @@ def test_refined(scene, dataset, fitted, tmp_path):
     assert code == 0 and 'refined of 4 views' in text and '5/5 (100%)' in err, err
     cloud = load_fit(fitted)
     measured = fitted_views(dataset.train, cloud.nominal_geometry)
-    own = cloud.volume(measured.geometry.grid)
+    cloud_volume = cloud.volume(measured.geometry.grid)
     blur = excess_width(measured.geometry)
     rates = dict(alpha=0.12, alpha_red=0.87, rmax=0.65, maxl2err=0, exact_every=5)
-    first = run_algorithm(complete_views(measured, cloud, 12), SART(1), start=own, weights=structure(own), blur=blur)
+    first = run_algorithm(
+        complete_views(measured, cloud, 12), SART(1), start=cloud_volume, weights=structure(cloud_volume), blur=blur
+    )
     then = run_algorithm(measured, ASDPOCS(4, **rates), start=first, weights=structure(first.volume), blur=blur)
     assert_same_volume(load(tmp_path / 'v.nii'), then.volume)
-    assert psnr_3d_r2(then.volume, dataset.volume) > psnr_3d_r2(own, dataset.volume) + 0.5
+    assert psnr_3d_r2(then.volume, dataset.volume) > psnr_3d_r2(cloud_volume, dataset.volume) + 0.5
     # Means of smaller voxels, on which the cloud is sampled anew.
     code, _, err = run(
         RECONSTRUCT,
@@ -233,9 +235,11 @@ def test_refined(scene, dataset, fitted, tmp_path):
     small = replace(
         measured, geometry=g.on(Grid([2 * n for n in g.grid.shape], [d / 2 for d in g.grid.spacing], g.grid.centre))
     )
-    own = cloud.volume(small.geometry.grid)
+    cloud_volume = cloud.volume(small.geometry.grid)
     fine = excess_width(small.geometry)
-    then = run_algorithm(small, ASDPOCS(2, **rates), start=own, weights=structure(own), blur=fine).volume
+    then = run_algorithm(
+        small, ASDPOCS(2, **rates), start=cloud_volume, weights=structure(cloud_volume), blur=fine
+    ).volume
     eight = [then[i::2, j::2, k::2] for i in (0, 1) for j in (0, 1) for k in (0, 1)]
     np.testing.assert_allclose(load(tmp_path / 's.nii'), np.mean(eight, 0), atol=1e-6 * then.max())
     # Of the measured views alone, which any scan will do for.
@@ -243,8 +247,8 @@ def test_refined(scene, dataset, fitted, tmp_path):
         RECONSTRUCT, scene, '--algorithm', 'refined', '-D', 'niter=2', '--start', fitted, '--out', tmp_path / 'm.nii'
     )
     assert code == 0 and 'refined of 4 views' in text and '2/2 (100%)' in err, err
-    own = cloud.volume(g.grid)
-    then = run_algorithm(measured, ASDPOCS(2, **rates), start=own, weights=structure(own), blur=blur)
+    cloud_volume = cloud.volume(g.grid)
+    then = run_algorithm(measured, ASDPOCS(2, **rates), start=cloud_volume, weights=structure(cloud_volume), blur=blur)
     np.testing.assert_array_equal(load(tmp_path / 'm.nii'), then.volume)
     code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'refined', '-D', 'completed_niter=1', '--start', fitted)
     assert code == 2 and err.count('error') == 1 and 'completed_niter must be 0' in err, err
@@ -416,7 +420,7 @@ def refused(*args):
 
 
 @pytest.mark.parametrize(
-    'given, says',
+    'entry, says',
     [
         ('"offOrigin" value="0, 0, 1000"', 'no ray meets the volume'),
         ('"offDetector" value="0, 500"', 'no ray meets the volume'),
@@ -424,10 +428,10 @@ def refused(*args):
         ('"DSD" value="1e5"', None),
     ],
 )
-def test_scans_that_see_no_volume(tmp_path, given, says):
-    name, line = given.split('"')[1], f'<string name={given}/>' if 'off' in given else f'<float name={given}/>'
+def test_scans_that_see_no_volume(tmp_path, entry, says):
+    name, line = (entry.split('"')[1], f'<string name={entry}/>' if 'off' in entry else f'<float name={entry}/>')
     old = f'<float name="{name}" value="{dict(DSO=100, DSD=150).get(name)}"/>'
-    new = (old, line) if 'off' not in given else ('<integer name="test_views"', line + '<integer name="test_views"')
+    new = (old, line) if 'off' not in entry else ('<integer name="test_views"', line + '<integer name="test_views"')
     path, out = changed_scene(tmp_path, new), ('--out', tmp_path / 'v.nii')
     if says is None:  # the panel sees a part of it
         code, _, err = run(RECONSTRUCT, path, *out)
@@ -505,12 +509,12 @@ def test_views_that_repeat_each_other(dataset):
     geometry = dataset.train.geometry
     twice = Scan(geometry.joined(geometry), np.arange(16.0)[:, None, None] * np.ones((1, *geometry.nDetector)))
 
-    def found(views):
+    def chosen(views):
         return fitted_views(twice, geometry.joined(geometry).subset(views)).projections[:, 0, 0].tolist()
 
-    assert found([0, 3, 6, 9, 12]) == [0, 3, 6, 9, 12] and found([3, 11, 4]) == [3, 11, 4]
+    assert chosen([0, 3, 6, 9, 12]) == [0, 3, 6, 9, 12] and chosen([3, 11, 4]) == [3, 11, 4]
     with pytest.raises(InputError, match='not all of them'):
-        found([3, 3, 3])
+        chosen([3, 3, 3])
 
 
 def test_corrected_poses(scene, tmp_path):
@@ -530,8 +534,10 @@ def test_corrected_poses(scene, tmp_path):
     out = '--out', tmp_path / 'v.nii', '--force'
     code, text, err = run(RECONSTRUCT, scene, '--algorithm', 'sart', '-D', 'niter=2', '--start', path, *out)
     assert code == 0 and 'of 4 views' in text, err
-    own = cloud.volume(geometry.grid)
-    expected = run_algorithm(as_corrected(measured, cloud), SART(2), start=own).volume  # up to the order of sums
+    cloud_volume = cloud.volume(geometry.grid)
+    expected = run_algorithm(
+        as_corrected(measured, cloud), SART(2), start=cloud_volume
+    ).volume  # up to the order of sums
     np.testing.assert_allclose(load(tmp_path / 'v.nii'), expected, rtol=1e-4, atol=1e-5 * expected.max())
     code, _, err = run(
         RECONSTRUCT, scene, '--algorithm', 'sart', '-D', 'niter=1', '--complete', path, '--views', 8, *out
@@ -563,8 +569,8 @@ def test_the_noise_is_that_of_the_fit(tmp_path):
 
     def expected(seed):
         scan = fitted_views(take_scan(load_scene(path), seed=seed).train, cloud.nominal_geometry)
-        own = cloud.volume(scan.geometry.grid)
-        return run_algorithm(without_effects(scan, cloud), SART(1), start=own).volume
+        cloud_volume = cloud.volume(scan.geometry.grid)
+        return run_algorithm(without_effects(scan, cloud), SART(1), start=cloud_volume).volume
 
     start = '--start', tmp_path / 'fit' / 'result.xml'
     np.testing.assert_allclose(volume(*start), expected(3), rtol=1e-4, atol=1e-5)

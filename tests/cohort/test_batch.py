@@ -89,9 +89,9 @@ def test_columns_of_text_and_numbers(tmp_path):
     table.done('b', dict(iterations=1400, views=6, psnr_2d=41))
     table.state('c', 'failed', 'why')
     table.finish()
-    found = parquet.read_table(tmp_path / 'results.parquet').to_pylist()
-    assert [row['iterations'] for row in found] == ['2000', '1400', '900']
-    assert [row['psnr_2d'] for row in found] == [40.5, 41, None]
+    read_rows = parquet.read_table(tmp_path / 'results.parquet').to_pylist()
+    assert [row['iterations'] for row in read_rows] == ['2000', '1400', '900']
+    assert [row['psnr_2d'] for row in read_rows] == [40.5, 41, None]
 
 
 @pytest.mark.parametrize('name', ['results.parquet', 'batch.log'])

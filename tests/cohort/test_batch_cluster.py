@@ -60,13 +60,13 @@ def require_all_done_once(home):
 
 def require_same(home, name, address):
     """The numbers are those of a fit on such a worker that nothing has interrupted: to the bit, but on a GPU."""
-    found = json.loads((home / 'out' / name / METRICS).read_text())
+    record = json.loads((home / 'out' / name / METRICS).read_text())
     rows = (home / 'list.csv').read_text().splitlines()
     (home / 'one.csv').write_text('\n'.join([rows[0], rows[1 + NAMES.index(name)]]))
     code, _, err = run(BATCH, home / 'one.csv', '--out', home / 'alone', '--cluster', address, '--threads', '1')
     assert code == 0, err
     wanted = json.loads((home / 'alone' / name / METRICS).read_text())
-    assert {k: found[k] for k in KEYS} == pytest.approx({k: wanted[k] for k in KEYS}, rel=fits_alike(0))
+    assert {k: record[k] for k in KEYS} == pytest.approx({k: wanted[k] for k in KEYS}, rel=fits_alike(0))
 
 
 @pytest.mark.thorough
@@ -75,9 +75,9 @@ def test_a_worker_is_killed(home):
     with cluster(home, workers=3) as (address, processes):
         numbers, batch = processes(), start(home, address)
         wait_until(lambda: half_done(home) or batch.poll() is not None)
-        found = half_done(home)
-        assert found, batch.communicate()
-        name, worker = found
+        fits_done = half_done(home)
+        assert fits_done, batch.communicate()
+        name, worker = fits_done
         os.kill(numbers[worker], signal.SIGKILL)
         out, err = batch.communicate(timeout=600)
         assert batch.returncode == 0, err

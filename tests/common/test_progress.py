@@ -18,11 +18,11 @@ def ticking(monkeypatch, seconds):
     """Let the clock go on by so many seconds whenever somebody looks at it."""
     now = [0.0]
 
-    def look():
+    def tick():
         now[0] += seconds
         return now[0]
 
-    monkeypatch.setattr(progress.time, 'monotonic', look)
+    monkeypatch.setattr(progress.time, 'monotonic', tick)
 
 
 def test_a_quick_loop_is_one_line(capsys, monkeypatch):

@@ -45,8 +45,8 @@ def test_counts_are_poisson():
     """The histogram of counts against the distribution, by chi-square."""
     counts = np.rint(detector(photons=20.0).signal(flat(0.25), 0) * 20).astype(int)
     expected = stats.poisson.pmf(np.arange(14), 5) * counts.size
-    found = np.bincount(counts.ravel(), minlength=14)[:14]
-    assert stats.chi2.sf(((found - expected) ** 2 / expected).sum(), 13) > 1e-3
+    histogram = np.bincount(counts.ravel(), minlength=14)[:14]
+    assert stats.chi2.sf(((histogram - expected) ** 2 / expected).sum(), 13) > 1e-3
 
 
 def test_pixels_views_and_seeds_are_independent():
@@ -87,19 +87,19 @@ def test_darkness_is_finite():
 def test_saturation_and_bits():
     ramp = np.linspace(0, 1.2, SHAPE[0] * SHAPE[1]).reshape(SHAPE)
     np.testing.assert_array_equal(detector(saturation=0.8).signal(ramp, 0), np.minimum(ramp, 0.8))
-    found = detector(saturation=0.8, bits=4).signal(ramp, 0)
-    assert len(np.unique(found)) == 16
-    assert np.abs(found - np.minimum(ramp, 0.8)).max() <= 0.5 * 0.8 / 15 * (1 + 1e-12)
+    signal = detector(saturation=0.8, bits=4).signal(ramp, 0)
+    assert len(np.unique(signal)) == 16
+    assert np.abs(signal - np.minimum(ramp, 0.8)).max() <= 0.5 * 0.8 / 15 * (1 + 1e-12)
 
 
 def test_gains_and_dead_pixels_are_corrected():
     smooth = np.exp(-1 - 0.3 * np.sin(np.indices(SHAPE)[1] / 30))
-    raw, mended = (detector(gain=0.1, dead=0.02, corrected=c) for c in (False, True))
+    raw, corrected = (detector(gain=0.1, dead=0.02, corrected=c) for c in (False, True))
     dead = raw.maps(SHAPE)[1]
     assert abs(dead.mean() - 0.02) < 4 * np.sqrt(0.02 * 0.98 / dead.size)
     assert abs(raw.maps(SHAPE)[0].std() - 0.1) < 0.003
-    np.testing.assert_allclose(mended.measure(smooth, 0)[~dead], -np.log(smooth)[~dead], atol=1e-6)
-    assert np.abs(mended.measure(smooth, 0) + np.log(smooth))[dead].max() < 0.02
+    np.testing.assert_allclose(corrected.measure(smooth, 0)[~dead], -np.log(smooth)[~dead], atol=1e-6)
+    assert np.abs(corrected.measure(smooth, 0) + np.log(smooth))[dead].max() < 0.02
     assert np.abs(raw.measure(smooth, 0) + np.log(smooth))[~dead].std() > 0.05
     np.testing.assert_allclose(raw.measure(smooth, 0)[dead], -np.log(raw.floor), rtol=1e-6)
 
@@ -137,8 +137,8 @@ def test_impossible_detectors(change, match):
 def test_a_point_spread_of_no_width_changes_nothing(variant):
     frames = CircularGeometry(DSO=100, DSD=150, nDetector=5, dDetector=1, angles=[0.0], grid=Grid(4, 1)).rays()
     image = np.random.default_rng(0).random(25).astype(np.float32)
-    found = detector(psf=1e-6).blurred(mi.Float(image), View.of(frames, 0, 5, 5))
-    np.testing.assert_allclose(found.numpy(), image, rtol=1e-6)
+    blurred = detector(psf=1e-6).blurred(mi.Float(image), View.of(frames, 0, 5, 5))
+    np.testing.assert_allclose(blurred.numpy(), image, rtol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -165,8 +165,8 @@ def test_quadrature_of_a_soft_edge():
     exact = (antiderivative(at + width / 2) - antiderivative(at - width / 2)) / width
     errors = []
     for order in (2, 4, 8):
-        found = sum(w * stats.norm.cdf(at + width * x) for w, x, y in square(order))
-        errors.append(np.abs(found - exact).max())
+        actual = sum(w * stats.norm.cdf(at + width * x) for w, x, y in square(order))
+        errors.append(np.abs(actual - exact).max())
     assert errors[0] < 2e-2 and errors[1] < 1e-4 and errors[2] < 1e-9
 
 

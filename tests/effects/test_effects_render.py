@@ -34,8 +34,8 @@ def scene_of(objects=None, tube=None, film=None, **settings):
     return load(objects | (dict(tube=tube) if tube else {}), SCANNER | (dict(film=film) if film else {}), **settings)
 
 
-def integrals(thing):
-    return render(load(dict(thing=thing))).ravel()
+def integrals(shape):
+    return render(load(dict(box=shape))).ravel()
 
 
 # ---- absent costs nothing --------------------------------------------------------------------------------------------
@@ -70,14 +70,14 @@ def kernels_with(*pairs):
 
 @physics
 def test_a_spectrum_adds_one_kernel():
-    ideal, found = kernels_with((None, None), (dict(TUBE, bands=2), None))
-    assert found[:-1] == ideal and found[-1] not in ideal
+    ideal, launched = kernels_with((None, None), (dict(TUBE, bands=2), None))
+    assert launched[:-1] == ideal and launched[-1] not in ideal
 
 
 def test_a_blur_adds_kernels_after_the_projectors():
-    ideal, found = kernels_with((None, None), (None, detector(psf=0.3)))
-    assert found[: len(ideal)] == ideal and len(found) > len(ideal)
-    assert not set(found[len(ideal) :]) & set(ideal)
+    ideal, launched = kernels_with((None, None), (None, detector(psf=0.3)))
+    assert launched[: len(ideal)] == ideal and len(launched) > len(ideal)
+    assert not set(launched[len(ideal) :]) & set(ideal)
 
 
 @pytest.mark.parametrize(
@@ -89,9 +89,9 @@ def test_a_blur_adds_kernels_after_the_projectors():
 )
 def test_bundles_of_rays_repeat_the_projectors(tube, film):
     """Kernels of the splat run once for each of 2 x 2 bundles; those that move a view, sum and take the logarithm are new."""
-    ideal, found = kernels_with((None, None), (tube, film))
-    assert max(found.count(h) for h in ideal) == 4
-    assert set(found) - set(ideal) and found[-1] not in ideal
+    ideal, launched = kernels_with((None, None), (tube, film))
+    assert max(launched.count(h) for h in ideal) == 4
+    assert set(launched) - set(ideal) and launched[-1] not in ideal
 
 
 @pytest.mark.parametrize(
@@ -103,8 +103,8 @@ def test_bundles_of_rays_repeat_the_projectors(tube, film):
 )
 def test_what_is_no_matter_of_kernels(tube, film):
     """Photons of the energy that densities are attenuation at, from a point; and what happens after the light, in NumPy."""
-    ideal, found = kernels_with((None, None), (tube, film))
-    assert found == ideal
+    ideal, launched = kernels_with((None, None), (tube, film))
+    assert launched == ideal
 
 
 # ---- hardening -------------------------------------------------------------------------------------------------------
@@ -122,9 +122,9 @@ def full(*pairs):
 def test_gaussians_grids_and_meshes_harden():
     objects = dict(cloud=ellipsoids(cloud_of()), grid=grid(values_of()), bolt=block(3.0))
     p = {k: integrals(v) for k, v in objects.items()}
-    found = render(scene_of(objects, dict(TUBE, material_bolt='Fe'))).ravel()
-    np.testing.assert_allclose(found, full((p['cloud'] + p['grid'], 'soft tissue'), (p['bolt'], 'Fe')), atol=2e-3)
-    assert np.abs(found - sum(p.values())).max() > 0.1
+    image = render(scene_of(objects, dict(TUBE, material_bolt='Fe'))).ravel()
+    np.testing.assert_allclose(image, full((p['cloud'] + p['grid'], 'soft tissue'), (p['bolt'], 'Fe')), atol=2e-3)
+    assert np.abs(image - sum(p.values())).max() > 0.1
 
 
 @physics
@@ -137,10 +137,10 @@ def test_two_materials():
     np.testing.assert_allclose(render(scene_of(dict(grid=grid(values)), two)).ravel(), expected, atol=5e-4)
 
     cloud, share = cloud_of(), np.linspace(0, 1, 6)
-    thing = ellipsoids(cloud) | dict(second=mi.TensorXf(np.float32(share)[:, None]))
+    mixed = ellipsoids(cloud) | dict(second=mi.TensorXf(np.float32(share)[:, None]))
     parts = (integrals(ellipsoids(cloud.changed(density=cloud.density * s))) for s in (1 - share, share))
     expected = full(*zip(parts, ('soft tissue', 'bone')))
-    np.testing.assert_allclose(render(scene_of(dict(cloud=thing), two)).ravel(), expected, atol=5e-4)
+    np.testing.assert_allclose(render(scene_of(dict(cloud=mixed), two)).ravel(), expected, atol=5e-4)
 
 
 @physics
@@ -179,9 +179,9 @@ def test_derivative_through_a_scene():
     dr.enable_grad(params['cloud.density'])
     params.update()
     dr.backward(dr.sum(mi.render(scene, params) * mi.TensorXf(np.float32(weights)), axis=None))
-    found = dr.grad(params['cloud.density']).numpy()
+    gradient = dr.grad(params['cloud.density']).numpy()
     expected = (loss(cloud.density + step * np.eye(6)[2]) - loss(cloud.density - step * np.eye(6)[2])) / (2 * step)
-    assert abs(found[2] - expected) < 1e-3 * np.abs(found).max()
+    assert abs(gradient[2] - expected) < 1e-3 * np.abs(gradient).max()
 
 
 @pytest.mark.parametrize('output', ['line_integral', 'transmission'])
@@ -201,9 +201,9 @@ def test_what_saturates_has_no_derivative(output):
         dr.set_grad(params['cloud.density'], 1)
         return reverse, dr.forward_to(mi.render(scene, params)).numpy() * weights
 
-    found = derivatives(weights, detector(saturation=0.95))
+    gradient = derivatives(weights, detector(saturation=0.95))
     expected = derivatives(weights * dark.reshape(weights.shape), None)
-    for f, e in zip(found, expected):
+    for f, e in zip(gradient, expected):
         np.testing.assert_allclose(f, e, atol=1e-6 * np.abs(e).max())
 
 
@@ -224,10 +224,10 @@ def test_derivative_with_gains_that_are_left_in(film):
     dr.enable_grad(params['cloud.density'])
     params.update()
     dr.set_grad(params['cloud.density'], density)
-    found = dr.forward_to(mi.render(scene, params)).numpy().ravel()
+    actual = dr.forward_to(mi.render(scene, params)).numpy().ravel()
     smooth = np.abs(image(1.01) + image(0.99) - 2 * image(1)) < 1e-4  # not where saturation ends in between
     assert smooth.mean() > 0.9 and np.abs(differences).max() > 0.01
-    np.testing.assert_allclose(found[smooth], differences[smooth], atol=2e-4)
+    np.testing.assert_allclose(actual[smooth], differences[smooth], atol=2e-4)
 
 
 # ---- focal spot and aperture -----------------------------------------------------------------------------------------
@@ -273,8 +273,8 @@ def edge_moments(tube, film, size=0.0025, columns=1600):
 )
 def test_edge_responses(tube, film, variance):
     """Magnified twice, a uniform spot of width w is a box of width w (DSD - DSO) / DSO = w at the panel; variances add."""
-    mean, found = edge_moments(tube, film) if film is None else edge_moments(tube, film, 0.01, 400)
-    assert abs(mean) < 0.003 and abs(found / variance - 1) < 0.01
+    mean, measured = edge_moments(tube, film) if film is None else edge_moments(tube, film, 0.01, 400)
+    assert abs(mean) < 0.003 and abs(measured / variance - 1) < 0.01
 
 
 @pytest.mark.parametrize('pixel', ['centre', 3, 'area'])
@@ -347,8 +347,8 @@ def test_a_panel_has_no_crop_window():
 @physics
 def test_second_material_of_a_mesh():
     tube = dict(TUBE, material='soft tissue + bone', split='0.3, 0.7')
-    for thing, match in ((block(), 'cannot be of two materials'), (ellipsoids(cloud_of()), 'no attribute "second"')):
-        scene = scene_of(dict(thing=thing), tube)
+    for shape, match in ((block(), 'cannot be of two materials'), (ellipsoids(cloud_of()), 'no attribute "second"')):
+        scene = scene_of(dict(box=shape), tube)
         with pytest.raises(InputError, match=match):
             through_mitsuba(scene)
 
@@ -358,7 +358,7 @@ def test_second_material_is_a_share(share):
     cloud = ellipsoids(cloud_of())
     cloud['second'] = mi.TensorXf(np.full((len(cloud_of().density), 1), share, np.float32))
     with pytest.raises(InputError, match='is a share in the density, from 0 to 1'):
-        through_mitsuba(scene_of(dict(thing=cloud)))
+        through_mitsuba(scene_of(dict(box=cloud)))
 
 
 @physics
@@ -379,8 +379,8 @@ def test_simulated_noise_is_not_subtracted(scene_file):
     scan, objects = take_scan(loaded).train, find_objects(loaded.scene)
     effects = scan.effects
     quiet = replace(effects, detector=effects.detector.expected)
-    found, wanted = (corrected(scan, e, objects).projections for e in (effects, quiet))
-    np.testing.assert_array_equal(found, wanted)
+    actual, wanted = (corrected(scan, e, objects).projections for e in (effects, quiet))
+    np.testing.assert_array_equal(actual, wanted)
 
 
 def test_dead_pixels_that_are_left_in_are_filled():
@@ -391,8 +391,8 @@ def test_dead_pixels_that_are_left_in_are_filled():
     effects = Effects(detector=detector)
     dead = detector.maps((20, 24))[1]
     assert dead.any() and seen[:, dead].min() > 10
-    found = line_integrals(lm.Scan(geometry, seen, effects=effects)).projections
-    np.testing.assert_allclose(found, np.broadcast_to(view, found.shape), atol=0.05)
+    projections = line_integrals(lm.Scan(geometry, seen, effects=effects)).projections
+    np.testing.assert_allclose(projections, np.broadcast_to(view, projections.shape), atol=0.05)
 
 
 def test_a_focal_spot_needs_a_panel_in_millimetres():

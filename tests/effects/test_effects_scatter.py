@@ -64,8 +64,8 @@ def test_bound_electrons(material):
 def test_energy_that_is_kept():
     cosine, weights = np.polynomial.legendre.leggauss(64)
     angles = np.arccos(cosine).tolist()
-    kept = [xraylib.DCS_KN(100.0, a) * xraylib.ComptonEnergy(100.0, a) / 100 for a in angles]
-    assert abs(R_E2 * scattering(100.0, '', 'energy')[1] / (2 * np.pi * weights @ kept) - 1) < 1e-5
+    energies = [xraylib.DCS_KN(100.0, a) * xraylib.ComptonEnergy(100.0, a) / 100 for a in angles]
+    assert abs(R_E2 * scattering(100.0, '', 'energy')[1] / (2 * np.pi * weights @ energies) - 1) < 1e-5
 
 
 @pytest.mark.parametrize(
@@ -260,7 +260,7 @@ def test_all_orders():
     g = geometry(DSD=480.0, dDetector=(7.0, 6.0))
     view = View.of(g.rays(), 0, *g.nDetector)
     expected, error = photons(g, 400_000, np.random.default_rng(0))
-    found = {}
+    results = {}
     for orders in (1, -1):
         means, errors = Scatter(4096, (12, 12), orders, energies=1).estimate([water_box()], tube_of(), 'count', view, 0)
         source, corner, u, v = pose(g)
@@ -268,10 +268,10 @@ def test_all_orders():
         beam = corner + (60 * x)[:, None] * u + (40 * x)[:, None, None] * v - source
         share = np.linalg.norm(beam, axis=-1) ** -3.0 * w * w[:, None]
         share /= share.sum()
-        found[orders] = (means * share).sum(), np.sqrt((errors**2 * share**2).sum())
-    assert error < 0.02 * expected and found[-1][1] < 0.02 * expected
-    assert abs(found[-1][0] - expected) < 3 * np.hypot(error, found[-1][1])
-    assert found[1][0] < 0.8 * expected
+        results[orders] = (means * share).sum(), np.sqrt((errors**2 * share**2).sum())
+    assert error < 0.02 * expected and results[-1][1] < 0.02 * expected
+    assert abs(results[-1][0] - expected) < 3 * np.hypot(error, results[-1][1])
+    assert results[1][0] < 0.8 * expected
 
 
 @pytest.mark.traces_rays
@@ -292,17 +292,17 @@ def test_two_names_of_one_material():
 def test_objects_on_a_grid():
     """Nothing of what attenuates gets lost: integrals over the box."""
     scene = load(dict(cloud=ellipsoids(cloud_of()), grid=grid(values_of()), bolt=block(1.3)))
-    cloud, values, bolt = sorted(find_objects(scene), key=lambda thing: ('cloud', 'grid', 'bolt').index(thing.name))
+    cloud, values, bolt = sorted(find_objects(scene), key=lambda obj: ('cloud', 'grid', 'bolt').index(obj.name))
     made = cloud_of()
     expected = {
         cloud: (made.density * np.prod(made.scale, 1)).sum() * (2 * np.pi) ** 1.5,
         values: values_of().mean() * 0.8 * 1.0 * 1.2,
         bolt: 1.3 * 8 * abs(np.linalg.det(np.array(block()['to_world'].matrix)[:3, :3])),
     }
-    for thing, integral in expected.items():
-        low, high = bounds([thing])
+    for obj, integral in expected.items():
+        low, high = bounds([obj])
         step = (high - low) / 48
-        assert abs(on_grid(thing, low, step, (48, 48, 48)).sum() * np.prod(step) / integral - 1) < 0.02
+        assert abs(on_grid(obj, low, step, (48, 48, 48)).sum() * np.prod(step) / integral - 1) < 0.02
     low, high = bounds([values])
     np.testing.assert_allclose(on_grid(values, low, (high - low) / (5, 4, 6), (5, 4, 6)), values_of(), rtol=1e-6)
 
@@ -384,7 +384,7 @@ def test_scan(scene_file):
 
 
 @pytest.mark.parametrize(
-    'given, match',
+    'parameters, match',
     [
         ('<integer name="scatter" value="-1"/>', "line 18: xray_tube 'tube': scatter must be a whole number from 0 to"),
         (
@@ -411,9 +411,9 @@ def test_scan(scene_file):
         ),
     ],
 )
-def test_one_line_that_names_element_and_place(scene_file, given, match):
+def test_one_line_that_names_element_and_place(scene_file, parameters, match):
     with pytest.raises(InputError, match=match) as caught:
-        load_scene(scene_file(XML.replace('<string name="material"', given + '<string name="material"')))
+        load_scene(scene_file(XML.replace('<string name="material"', parameters + '<string name="material"')))
     assert '\n' not in str(caught.value)
 
 

@@ -43,13 +43,13 @@ def half_value_layer(spectrum, material):
     [(120, 12, 'Al 2.5', 54.4, 4.22), (120, 12, '', None, None), (80, 12, 'Al 2.5, Cu 0.2', None, None)],
 )
 def test_tube(kvp, angle, filtration, mean, layer):
-    found = tube_spectrum(kvp, angle, filtration)
-    assert abs(found.photons.sum() - 1) < 1e-12 and found.energies[-1] < kvp
+    spectrum = tube_spectrum(kvp, angle, filtration)
+    assert abs(spectrum.photons.sum() - 1) < 1e-12 and spectrum.energies[-1] < kvp
     if mean:
         # spekpy says 4.22 mm with tables of its own, which agree with xraylib's to 1 %
-        assert abs(found.mean - mean) < 0.05 and abs(half_value_layer(found, 'Al') / layer - 1) < 0.01
+        assert abs(spectrum.mean - mean) < 0.05 and abs(half_value_layer(spectrum, 'Al') / layer - 1) < 0.01
     else:  # without a filter softer, with copper harder than with aluminium
-        assert (found.mean < tube_spectrum(kvp).mean) == (filtration == '')
+        assert (spectrum.mean < tube_spectrum(kvp).mean) == (filtration == '')
 
 
 def test_filter_is_attenuation():
@@ -57,8 +57,8 @@ def test_filter_is_attenuation():
     thin, thick = tube_spectrum(120, filtration='Al 2.5'), tube_spectrum(120, filtration='Al 7.5')
     high = thin.energies > 30
     expected = thin.photons[high] * np.exp(-5 * attenuation('Al', thin.energies[high]))
-    found = thick.photons[high]
-    assert np.abs(found / found.sum() / (expected / expected.sum()) - 1).max() < 0.015
+    photons = thick.photons[high]
+    assert np.abs(photons / photons.sum() / (expected / expected.sum()) - 1).max() < 0.015
 
 
 def test_second_time_it_is_read(tmp_path, monkeypatch):
@@ -150,10 +150,10 @@ def test_error_against_the_full_spectrum(materials, errors, response):
     u = np.random.default_rng(0).dirichlet(np.ones(len(materials) + 1), 500)[:, :-1] * most
     exact = measured(u)
     for count, most in enumerate(errors, 1):
-        found = band(signal, r, count, 10.0)
-        error = np.abs(found.hardened(*u.T) - exact).max()
-        assert error < 1.1 * found.error and found.error < most
-        assert abs(found.weights.sum() - 1) < 1e-12 and found.weights.min() > 0
+        actual = band(signal, r, count, 10.0)
+        error = np.abs(actual.hardened(*u.T) - exact).max()
+        assert error < 1.1 * actual.error and actual.error < most
+        assert abs(actual.weights.sum() - 1) < 1e-12 and actual.weights.min() > 0
 
 
 @pytest.mark.parametrize('reference', [20.0, 60.0, 110.0])
@@ -161,32 +161,32 @@ def test_bands_are_right_at_any_reference_energy(reference):
     """Iron, until one photon in two thousand is left."""
     spectrum = tube_spectrum(120.0)
     mu = attenuation('Fe', spectrum.energies)
-    found = band(spectrum.detected('energy'), [mu / attenuation('Fe', [reference])], 5, 10.0)
+    actual = band(spectrum.detected('energy'), [mu / attenuation('Fe', [reference])], 5, 10.0)
     thickness = np.linspace(0, 21, 50)  # mm
     exact = -np.log(np.exp(-np.outer(thickness, mu)) @ spectrum.detected('energy'))
     assert exact.max() > 7.5
-    np.testing.assert_allclose(found.hardened(thickness * attenuation('Fe', [reference])), exact, atol=5e-3)
+    np.testing.assert_allclose(actual.hardened(thickness * attenuation('Fe', [reference])), exact, atol=5e-3)
 
 
 def test_monochromatic_needs_one_band():
-    found = band(np.ones(1), [[1.3], [0.7]], 4, 10.0)
-    np.testing.assert_allclose(found.hardened(2.0, 3.0), 1.3 * 2 + 0.7 * 3)
+    actual = band(np.ones(1), [[1.3], [0.7]], 4, 10.0)
+    np.testing.assert_allclose(actual.hardened(2.0, 3.0), 1.3 * 2 + 0.7 * 3)
 
 
 def test_hard_beam_is_a_straight_line():
     """The more a beam has passed, the less is attenuated of what is left."""
-    found = band(tube_spectrum(120.0).detected('energy'), ratios(tube_spectrum(120.0), 'water'), 4, 10.0)
+    actual = band(tube_spectrum(120.0).detected('energy'), ratios(tube_spectrum(120.0), 'water'), 4, 10.0)
     p = np.linspace(0, 10, 50)
-    slope = np.diff(found.hardened(p))
-    assert found.hardened(0.0) == pytest.approx(0, abs=1e-12) and np.all(np.diff(slope) < 0)
+    slope = np.diff(actual.hardened(p))
+    assert actual.hardened(0.0) == pytest.approx(0, abs=1e-12) and np.all(np.diff(slope) < 0)
 
 
 def test_precorrection_is_the_inverse():
-    found = band(tube_spectrum(120.0).detected('energy'), ratios(tube_spectrum(120.0), 'water'), 4, 10.0)
+    actual = band(tube_spectrum(120.0).detected('energy'), ratios(tube_spectrum(120.0), 'water'), 4, 10.0)
     p = np.linspace(0, 40, 401).reshape(1, 401)
-    np.testing.assert_allclose(found.precorrected(found.hardened(p)), p, atol=1e-12)
-    slope = found.weights @ found.ratios[0]
-    np.testing.assert_allclose(found.precorrected([-0.3, 0.0]), [-0.3 / slope, 0], atol=1e-12)
+    np.testing.assert_allclose(actual.precorrected(actual.hardened(p)), p, atol=1e-12)
+    slope = actual.weights @ actual.ratios[0]
+    np.testing.assert_allclose(actual.precorrected([-0.3, 0.0]), [-0.3 / slope, 0], atol=1e-12)
     with pytest.raises(InputError, match='one material'):
         Bands(np.ones(1), np.ones((2, 1))).precorrected(1.0)
 

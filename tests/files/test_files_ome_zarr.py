@@ -26,10 +26,12 @@ def image(folder, array, axes='zyx', version=3, unit='millimeter', transformatio
     stored = group.create_array('0', shape=array.shape, chunks=array.shape, dtype=array.dtype, **options)
     stored[...] = array
     names = [dict(name=a, type='space', unit=unit) if a in 'xyz' else dict(name=a, type='channel') for a in axes]
-    found = [dict(axes=names, datasets=[dict(path='0', coordinateTransformations=list(transformations))])]
+    multiscales = [dict(axes=names, datasets=[dict(path='0', coordinateTransformations=list(transformations))])]
     if everywhere:
-        found[0]['coordinateTransformations'] = list(everywhere)
-    group.attrs.update(dict(ome=dict(version='0.5', multiscales=found)) if version == 3 else dict(multiscales=found))
+        multiscales[0]['coordinateTransformations'] = list(everywhere)
+    group.attrs.update(
+        dict(ome=dict(version='0.5', multiscales=multiscales)) if version == 3 else dict(multiscales=multiscales)
+    )
     return folder
 
 
@@ -45,10 +47,10 @@ def test_what_is_written_is_read_unchanged(tmp_path, volume):
         angles=[0.0],
     )
     write_slabs(tmp_path / 'v.ome.zarr', g.grid, [volume])
-    found = read_volume(tmp_path / 'v.ome.zarr')
-    np.testing.assert_array_equal(found.data, volume)
-    assert found.unit == 'density per mm' and found.spacing == (1, 1.5, 2)
-    np.testing.assert_allclose(found.affine[:3, 3], g.grid.first_voxel)
+    read = read_volume(tmp_path / 'v.ome.zarr')
+    np.testing.assert_array_equal(read.data, volume)
+    assert read.unit == 'density per mm' and read.spacing == (1, 1.5, 2)
+    np.testing.assert_allclose(read.affine[:3, 3], g.grid.first_voxel)
 
 
 @pytest.mark.parametrize('version', [2, 3])
@@ -58,15 +60,15 @@ def test_of_others(tmp_path, volume, version):
     steps = dict(type='scale', scale=[1.0, 2000.0, 1500.0, 1000.0])
     whole = (1000 * volume.transpose(2, 1, 0)[None]).astype(np.uint16)
     folder = image(tmp_path / 'v.zarr', whole, 'czyx', version, 'micrometer', (steps, shift))
-    found = read_volume(folder)
-    np.testing.assert_allclose(found.data, whole[0].transpose(2, 1, 0) / whole.max(), rtol=1e-6)
-    assert found.spacing == (1, 1.5, 2) and found.unit == 'normalised'
-    np.testing.assert_allclose(found.affine[:3, 3], [0.02, 0.03, 0.04])
+    read = read_volume(folder)
+    np.testing.assert_allclose(read.data, whole[0].transpose(2, 1, 0) / whole.max(), rtol=1e-6)
+    assert read.spacing == (1, 1.5, 2) and read.unit == 'normalised'
+    np.testing.assert_allclose(read.affine[:3, 3], [0.02, 0.03, 0.04])
 
 
 def test_transformations_of_all_levels_come_after_those_of_one(tmp_path, volume):
     shift = dict(type='translation', translation=[4.0, 5.0, 6.0])
-    found = read_volume(
+    read = read_volume(
         image(
             tmp_path / 'v.zarr',
             volume.transpose(2, 1, 0),
@@ -74,14 +76,14 @@ def test_transformations_of_all_levels_come_after_those_of_one(tmp_path, volume)
             everywhere=[dict(type='scale', scale=[0.05, 0.1, 0.2])],
         )
     )
-    np.testing.assert_allclose(found.spacing, (0.2, 0.15, 0.1))
-    np.testing.assert_allclose(found.affine[:3, 3], [1.2, 0.5, 0.2])
+    np.testing.assert_allclose(read.spacing, (0.2, 0.15, 0.1))
+    np.testing.assert_allclose(read.affine[:3, 3], [1.2, 0.5, 0.2])
 
 
 def test_other_axes(tmp_path, volume):
-    found = read_volume(image(tmp_path / 'v.zarr', volume, 'xyz'))
-    np.testing.assert_allclose(found.data, volume / volume.max(), rtol=1e-6)
-    assert found.spacing == (2, 1.5, 1)
+    read = read_volume(image(tmp_path / 'v.zarr', volume, 'xyz'))
+    np.testing.assert_allclose(read.data, volume / volume.max(), rtol=1e-6)
+    assert read.spacing == (2, 1.5, 1)
 
 
 @pytest.mark.parametrize(
@@ -107,9 +109,9 @@ def test_several_channels(tmp_path, volume):
 
 def damage(folder, name, change):
     path = folder / name
-    found = json.loads(path.read_text())
-    change(found)
-    path.write_text(json.dumps(found))
+    record = json.loads(path.read_text())
+    change(record)
+    path.write_text(json.dumps(record))
 
 
 def test_codecs_that_run_code_are_refused(tmp_path, volume):

@@ -206,8 +206,8 @@ def test_matrices_in_the_file_for_rtk(tmp_path):
     rtk.write_rtk(tmp_path / 'again.xml', f, SHAPE)
     text = (tmp_path / 'again.xml').read_text()
     parts = [part.split('</Matrix>')[0].split() for part in text.split('<Matrix>')[1:]]
-    found = [np.reshape([float(x) for x in part], (3, 4)) for part in parts]
-    np.testing.assert_allclose(found, RTK_MATRICES, rtol=1e-11, atol=1e-9)
+    read = [np.reshape([float(x) for x in part], (3, 4)) for part in parts]
+    np.testing.assert_allclose(read, RTK_MATRICES, rtol=1e-11, atol=1e-9)
     one = circle(
         DSO=300.0, DSD=450.0, nDetector=SHAPE, dDetector=STEP, **GRID, angles=[0.3, 1.0], offDetector=(3.0, -4.0)
     )
@@ -248,8 +248,13 @@ def test_formats_of_circles_refuse_other_poses(tmp_path, kind):
 
 def npy(tmp_path, **values):
     np.save(tmp_path / 'scan.npy', projections())
-    known = {'nDetector': list(SHAPE), 'dDetector': list(STEP), 'nVoxel': [5, 6, 7], 'dVoxel': [1.0, 2.0, 3.0]} | values
-    (tmp_path / 'scan.yml').write_text(yaml.safe_dump({k: v for k, v in known.items() if v is not ...}))
+    numbers = {
+        'nDetector': list(SHAPE),
+        'dDetector': list(STEP),
+        'nVoxel': [5, 6, 7],
+        'dVoxel': [1.0, 2.0, 3.0],
+    } | values
+    (tmp_path / 'scan.yml').write_text(yaml.safe_dump({k: v for k, v in numbers.items() if v is not ...}))
     return tmp_path / 'scan.npy'
 
 
@@ -457,11 +462,11 @@ def test_what_rtk_calls_its_numbers(tmp_path):
     rtk.write_rtk(tmp_path / 'g.xml', scan_of().rays(), SHAPE)
     (shared, *views) = ElementTree.parse(tmp_path / 'g.xml').getroot().iter()
     names = {e.tag for e in (shared, *views)}
-    known = {
+    expected = {
         'RTKThreeDCircularGeometry',
         'Projection',
         'Matrix',
         *('SourceToIsocenterDistance', 'SourceToDetectorDistance', 'GantryAngle', 'OutOfPlaneAngle', 'InPlaneAngle'),
         *('ProjectionOffsetX', 'ProjectionOffsetY', 'SourceOffsetX', 'SourceOffsetY'),
     }
-    assert names == known
+    assert names == expected

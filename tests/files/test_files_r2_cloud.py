@@ -65,11 +65,11 @@ def test_where_its_training_starts(tmp_path):
     """Four points at the corners of a square of 0.1: the three nearest are at 0.1, 0.1 and 0.1 sqrt 2."""
     points = np.array([[0, 0, 0, 1], [0.1, 0, 0, 2], [0, 0.1, 0, 3], [0.1, 0.1, 0, 4.0]])
     np.save(tmp_path / 'init_a.npy', points)
-    found = lm.Gaussians.from_r2(tmp_path / 'init_a.npy', GRID)
-    np.testing.assert_allclose(found.means, 100 * points[:, :3], rtol=1e-6)
-    np.testing.assert_allclose(found.scales, 10 * np.sqrt(4 / 3), rtol=1e-6)
-    assert found.quaternions.tolist() == [[0, 0, 0, 1]] * 4 and found.density.tolist() == [1, 2, 3, 4]
-    found.to_r2(tmp_path / 'b.npy', GRID)
+    gaussians = lm.Gaussians.from_r2(tmp_path / 'init_a.npy', GRID)
+    np.testing.assert_allclose(gaussians.means, 100 * points[:, :3], rtol=1e-6)
+    np.testing.assert_allclose(gaussians.scales, 10 * np.sqrt(4 / 3), rtol=1e-6)
+    assert gaussians.quaternions.tolist() == [[0, 0, 0, 1]] * 4 and gaussians.density.tolist() == [1, 2, 3, 4]
+    gaussians.to_r2(tmp_path / 'b.npy', GRID)
     np.testing.assert_allclose(np.load(tmp_path / 'b.npy'), points, rtol=1e-6)
 
 

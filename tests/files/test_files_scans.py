@@ -285,8 +285,8 @@ def test_unknown_paths(tmp_path):
     for name in 'frames.tif', 'scan.nxs', 'folder/0001.EDF':
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
-        given = tmp_path / name.partition('/')[0]
-        refused(given, f'lingo-mi import {given} --geometry')
+        path = tmp_path / name.partition('/')[0]
+        refused(path, f'lingo-mi import {path} --geometry')
     refused(tmp_path / 'a.xyz', 'carries its own geometry', geometry='g.yml')
 
 
@@ -378,12 +378,12 @@ def test_bad_walnuts(tmp_path):
 
 def test_the_voxels_of_a_scene_are_used_with_measured_projections(tmp_path):
     path = walnut(tmp_path)
-    for given, count, size in (
+    for options, count, size in (
         (dict(nVoxel='7, 8, 9', dVoxel='2'), (7, 8, 9), (2.0,) * 3),
         (dict(dVoxel='1, 2, 3'), (128,) * 3, (1.0, 2.0, 3.0)),
         ({}, (128,) * 3, (0.305,) * 3),
     ):
-        scanner = mi.load_dict({'type': 'ct_scanner', 'projections': str(path), **given})
+        scanner = mi.load_dict({'type': 'ct_scanner', 'projections': str(path), **options})
         assert (scanner.geometry.grid.shape, scanner.geometry.grid.spacing) == (count, size)
         assert scanner.dataset.train.geometry is scanner.geometry
 

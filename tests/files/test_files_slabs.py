@@ -48,10 +48,10 @@ def test_nifti(tmp_path, name):
     write_volume(tmp_path / 'whole.nii', v, g.grid, 'density per mm')
     if name.endswith('.nii'):
         assert (tmp_path / name).read_bytes() == (tmp_path / 'whole.nii').read_bytes()
-    found, whole = read_volume(tmp_path / name), read_volume(tmp_path / 'whole.nii')
-    np.testing.assert_array_equal(found.data, v)
-    np.testing.assert_array_equal(found.affine, whole.affine)
-    assert found.unit == whole.unit == 'density per mm'
+    actual, whole = read_volume(tmp_path / name), read_volume(tmp_path / 'whole.nii')
+    np.testing.assert_array_equal(actual.data, v)
+    np.testing.assert_array_equal(actual.affine, whole.affine)
+    assert actual.unit == whole.unit == 'density per mm'
 
 
 @pytest.mark.parametrize('thickness', [64, 7, 1])
@@ -105,8 +105,8 @@ def test_fdk(thickness):
     g = geometry((24, 20, 16), (4.0, 5.0, 6.0))
     scan = lm.simulate(noise((24, 20, 16)), g, progress=False).train
     whole = run_algorithm(scan, lm.FDK()).volume
-    found = np.concatenate(list(lm.FDK().slabs(scan, thickness)), 2)
-    assert np.abs(found - whole).max() < 2e-6 * np.abs(whole).max()
+    volume = np.concatenate(list(lm.FDK().slabs(scan, thickness)), 2)
+    assert np.abs(volume - whole).max() < 2e-6 * np.abs(whole).max()
 
 
 def test_a_cloud(tmp_path):
@@ -129,9 +129,9 @@ def test_completed_views_need_no_volume(tmp_path, monkeypatch):
     lm.fit(data, 'fast', iterations=10, n_points=100, progress=False).save(tmp_path / 'fit')
     large = data.train.geometry.on(Grid((120, 120, 24), 1))
     write_scan(tmp_path / 'scan.npy', lm.Scan(large, data.train.projections), 'npy')
-    given = '--projections', tmp_path / 'scan.npy', '--algorithm', 'sart', '-D', 'niter=1'
+    arguments = '--projections', tmp_path / 'scan.npy', '--algorithm', 'sart', '-D', 'niter=1'
     views = '--complete', tmp_path / 'fit' / 'result.xml', '--views', 12
-    command = RECONSTRUCT, scene, *given, *views, '--out', tmp_path / 'v.nii'
+    command = RECONSTRUCT, scene, *arguments, *views, '--out', tmp_path / 'v.nii'
     monkeypatch.setattr('lingo_mi.scene.checks.room', lambda: 4e6)  # bytes; the volume has 1.4e6
     code, _, err = run(*command)
     assert code == 2 and 'of memory' in err
@@ -183,11 +183,11 @@ def test_the_command(tmp_path):
             code, text, err = run(RECONSTRUCT, scene, '--algorithm', algorithm, *more, *slab, '--out', name)
             assert code == 0 and str(name) in text, err
         whole = read_volume(names[0]).data
-        found = [
+        actual = [
             read_volume(names[1]).data,
             *(zarr.open_group(str(n), mode='r')['0'][:].transpose(2, 1, 0) for n in names[2:]),
         ]
-        for volume in found:
+        for volume in actual:
             assert np.abs(volume - whole).max() < 2e-6 * np.abs(whole).max()
     code, _, err = run(RECONSTRUCT, scene, '--algorithm', 'cgls', '--slab', 8, '--out', tmp_path / 'x.nii')
     assert code == 2 and '--slab is' in err

@@ -385,9 +385,9 @@ IMAGEJ = dict(imagej=True, resolution=(1 / 4, 1 / 4))
 def test_voxel_size_in_tiff(tmp_path, name, written, spacing):
     tifffile = needs('tifffile')
     tifffile.imwrite(tmp_path / name, COUNTS.transpose(2, 1, 0), photometric='minisblack', **written)
-    found = read_volume(tmp_path / name)
-    np.testing.assert_allclose(found.spacing, spacing, rtol=1e-6)
-    np.testing.assert_allclose(found.data, COUNTS / 119, rtol=1e-6)
+    volume = read_volume(tmp_path / name)
+    np.testing.assert_allclose(volume.spacing, spacing, rtol=1e-6)
+    np.testing.assert_allclose(volume.data, COUNTS / 119, rtol=1e-6)
     if spacing[0] != 1:
         refused(tmp_path / name, 'carries its own voxel size', spacing=2)
 

@@ -30,15 +30,15 @@ def path(scan, tmp_path):
 
 
 def test_what_was_written(scan, path):
-    found = read_scan(path).train
-    np.testing.assert_array_equal(found.views([7, 2]), scan.projections[[7, 2]])
-    np.testing.assert_array_equal(found.subset(slice(1, 9, 3)).views([2, 0]), scan.projections[[7, 1]])
-    assert 'projections' not in vars(found) and str(path) in repr(found)
-    there = pickle.loads(pickle.dumps(found.on(scan.geometry.grid)))
+    actual = read_scan(path).train
+    np.testing.assert_array_equal(actual.views([7, 2]), scan.projections[[7, 2]])
+    np.testing.assert_array_equal(actual.subset(slice(1, 9, 3)).views([2, 0]), scan.projections[[7, 1]])
+    assert 'projections' not in vars(actual) and str(path) in repr(actual)
+    there = pickle.loads(pickle.dumps(actual.on(scan.geometry.grid)))
     np.testing.assert_array_equal(np.concatenate(list(there.pieces())), scan.projections)
-    assert found.digest() == scan.digest()
-    np.testing.assert_array_equal(found.projections, scan.projections)  # all of them, where a caller wants so
-    np.testing.assert_array_equal(replace(found, effects=None).projections, scan.projections)
+    assert actual.digest() == scan.digest()
+    np.testing.assert_array_equal(actual.projections, scan.projections)  # all of them, where a caller wants so
+    np.testing.assert_array_equal(replace(actual, effects=None).projections, scan.projections)
     assert lm.load(path, views=5).test.views(slice(None)).shape == (5, 6, 8)
 
 
@@ -56,19 +56,19 @@ def refused(words, do):
 
 
 def test_a_chunk_is_missing(path):
-    found = read_scan(path).train
+    actual = read_scan(path).train
     (path / 'c' / '1' / '0' / '0').unlink()
     refused('scan.zarr: lacks a chunk of the views 4 to 7', lambda: read_scan(path))
-    refused('scan.zarr: lacks a chunk of the views 4 to 7', lambda: found.views([1, 5]))
-    assert found.views([9]).shape == (1, 6, 8)
+    refused('scan.zarr: lacks a chunk of the views 4 to 7', lambda: actual.views([1, 5]))
+    assert actual.views([9]).shape == (1, 6, 8)
 
 
 def test_a_chunk_ends_early(path):
     file = path / 'c' / '2' / '0' / '0'
     file.write_bytes(file.read_bytes()[:100])
-    found = read_scan(path).train
-    assert found.views([0]).shape == (1, 6, 8)
-    refused('scan.zarr: a chunk of the views 8 to 9 is cut off or damaged', lambda: found.views([9, 8]))
+    actual = read_scan(path).train
+    assert actual.views([0]).shape == (1, 6, 8)
+    refused('scan.zarr: a chunk of the views 8 to 9 is cut off or damaged', lambda: actual.views([9, 8]))
 
 
 def test_bad_input(scan, path):

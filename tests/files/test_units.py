@@ -18,7 +18,7 @@ WATER = 0.0206
 
 
 @pytest.fixture(scope='module')
-def found():
+def reconstruction():
     """Air, water, bone and what noise makes of air."""
     density = np.random.default_rng(0).uniform(-0.002, 0.05, GRID.shape).astype(np.float32)
     density[0, 0, :3] = 0, WATER, 2 * WATER
@@ -50,44 +50,46 @@ def test_values_in_every_unit():
         ('1/m', None, "must be '1/mm', '1/cm' or 'hu'"),
     ],
 )
-def test_units_that_are_refused(found, tmp_path, units, mu_water, message):
+def test_units_that_are_refused(reconstruction, tmp_path, units, mu_water, message):
     with pytest.raises(InputError, match=message):
-        found.save(tmp_path / 'v.nii', units=units, mu_water=mu_water)
+        reconstruction.save(tmp_path / 'v.nii', units=units, mu_water=mu_water)
     assert not any(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize('name', ['v.nii', 'v.nii.gz', 'v.ome.zarr'])
 @pytest.mark.parametrize(('units', 'mu_water'), [('1/cm', None), ('hu', WATER)])
-def test_a_volume_in_other_units_is_read_as_densities(found, tmp_path, name, units, mu_water):
+def test_a_volume_in_other_units_is_read_as_densities(reconstruction, tmp_path, name, units, mu_water):
     if name.endswith('zarr'):
         pytest.importorskip('ome_zarr')
-    read = read_volume(found.save(tmp_path / name, units=units, mu_water=mu_water))
-    np.testing.assert_allclose(read.data, found.volume, atol=2e-8)
+    read = read_volume(reconstruction.save(tmp_path / name, units=units, mu_water=mu_water))
+    np.testing.assert_allclose(read.data, reconstruction.volume, atol=2e-8)
     assert read.unit == 'density per mm' and read.spacing == GRID.spacing
 
 
-def test_nifti_says_its_unit_to_others(found, tmp_path):
+def test_nifti_says_its_unit_to_others(reconstruction, tmp_path):
     nibabel = pytest.importorskip('nibabel')
-    image = nibabel.load(found.save(tmp_path / 'v.nii.gz', units='hu', mu_water=WATER))
+    image = nibabel.load(reconstruction.save(tmp_path / 'v.nii.gz', units='hu', mu_water=WATER))
     assert bytes(image.header['descrip'].item()).startswith(b'lingo_mi: HU, water 0.0206 per mm')
-    np.testing.assert_allclose(image.get_fdata(), hounsfield(found.volume), atol=1e-3)
+    np.testing.assert_allclose(image.get_fdata(), hounsfield(reconstruction.volume), atol=1e-3)
     np.testing.assert_allclose(image.affine[:3, 3], GRID.first_voxel)
 
 
 @pytest.fixture(scope='module')
-def series(found, tmp_path_factory):
+def series(reconstruction, tmp_path_factory):
     pytest.importorskip('pydicom')
-    return found.save(tmp_path_factory.mktemp('dicom') / 'v.dicom', units='hu', mu_water=WATER)
+    return reconstruction.save(tmp_path_factory.mktemp('dicom') / 'v.dicom', units='hu', mu_water=WATER)
 
 
-def test_dicom_is_read_back_with_its_place(found, series, tmp_path):
-    read, nifti = read_volume(series, mu_water=WATER), read_volume(found.save(tmp_path / 'v.nii'))
-    np.testing.assert_allclose(read.data, np.maximum(found.volume, 0), atol=0.51 * WATER / 1000)  # steps of 1 HU
+def test_dicom_is_read_back_with_its_place(reconstruction, series, tmp_path):
+    read, nifti = read_volume(series, mu_water=WATER), read_volume(reconstruction.save(tmp_path / 'v.nii'))
+    np.testing.assert_allclose(
+        read.data, np.maximum(reconstruction.volume, 0), atol=0.51 * WATER / 1000
+    )  # steps of 1 HU
     np.testing.assert_allclose(read.affine, nifti.affine, atol=1e-6)
     assert read.spacing == pytest.approx(GRID.spacing)
 
 
-def test_dicom_for_pydicom(found, series):
+def test_dicom_for_pydicom(reconstruction, series):
     pydicom = pytest.importorskip('pydicom')
     slices = [pydicom.dcmread(file) for file in sorted(series.iterdir())]
     assert len(slices) == 7
@@ -101,32 +103,32 @@ def test_dicom_for_pydicom(found, series):
         x, y, z = GRID.first_voxel
         np.testing.assert_allclose(np.array(s.ImagePositionPatient, float), [-x, -y, z + 1.25 * k])
         values = s.pixel_array * float(s.RescaleSlope) + float(s.RescaleIntercept)
-        np.testing.assert_allclose(values, hounsfield(found.volume)[:, :, k].T, atol=0.51)
+        np.testing.assert_allclose(values, hounsfield(reconstruction.volume)[:, :, k].T, atol=0.51)
 
 
-def test_dicom_for_simpleitk(found, series):
+def test_dicom_for_simpleitk(reconstruction, series):
     itk = pytest.importorskip('SimpleITK')
     names = itk.ImageSeriesReader.GetGDCMSeriesFileNames(str(series))
     image = itk.ReadImage(names)
     np.testing.assert_allclose(image.GetSpacing(), GRID.spacing)
-    np.testing.assert_allclose(itk.GetArrayFromImage(image).T, hounsfield(found.volume), atol=0.51)
+    np.testing.assert_allclose(itk.GetArrayFromImage(image).T, hounsfield(reconstruction.volume), atol=0.51)
     for index in ((0, 0, 0), (4, 5, 6)):
         right, front, up = np.array(GRID.first_voxel) + np.array(index) * GRID.spacing  # NIfTI's axes
         np.testing.assert_allclose(image.TransformIndexToPhysicalPoint(index), [-right, -front, up], atol=1e-6)
 
 
-def test_dicom_that_cannot_be_written(found, tmp_path):
+def test_dicom_that_cannot_be_written(reconstruction, tmp_path):
     pytest.importorskip('pydicom')
     with pytest.raises(InputError, match="are in Hounsfield units: give units='hu'"):
-        found.save(tmp_path / 'v.dicom')
+        reconstruction.save(tmp_path / 'v.dicom')
     with pytest.raises(InputError, match='do not fit into the 16 bits'):
-        found.save(tmp_path / 'v.dicom', units='hu', mu_water=1e-3)
+        reconstruction.save(tmp_path / 'v.dicom', units='hu', mu_water=1e-3)
     assert not any(tmp_path.iterdir())
 
 
-def test_slabs_make_the_same_series(found, series, tmp_path):
+def test_slabs_make_the_same_series(reconstruction, series, tmp_path):
     pydicom = pytest.importorskip('pydicom')
-    slabs = (found.volume[:, :, a:b] for a, b in GRID.slabs(3))
+    slabs = (reconstruction.volume[:, :, a:b] for a, b in GRID.slabs(3))
     write_slabs(tmp_path / 'v.dicom', GRID, slabs, unit_of('hu', WATER))
     for a, b in zip(sorted(series.iterdir()), sorted((tmp_path / 'v.dicom').iterdir())):
         assert pydicom.dcmread(a).PixelData == pydicom.dcmread(b).PixelData
@@ -147,8 +149,8 @@ def test_a_volume_to_scan_and_to_write_in_hounsfield_units(tmp_path, monkeypatch
     mu = np.zeros((8, 8, 8), np.float32)
     mu[2:6, 2:6, 2:6] = 0.02
     np.save(tmp_path / 'v.npy', values(mu))
-    given = dict(volume=str(tmp_path / 'v.npy'), projections=None, shape=None, dtype=None, spacing=[4.0], units='hu')
-    args = argparse.Namespace(**given, mu_water=WATER)
+    options = dict(volume=str(tmp_path / 'v.npy'), projections=None, shape=None, dtype=None, spacing=[4.0], units='hu')
+    args = argparse.Namespace(**options, mu_water=WATER)
     if expected is None:
         with pytest.raises(InputError, match="not attenuation per mm, so that units='hu' cannot be written"):
             read_input(args, None, 0)

@@ -38,16 +38,16 @@ def data():
 def test_fit(method, data, tmp_path, no_report):
     """Held-out views are predicted; what is written is read again, with the curved panel."""
     fit = lm.fit(data, method, iterations=120, progress=False)
-    found = fit.metrics()['psnr_2d']
-    assert found > 30
+    psnr = fit.metrics()['psnr_2d']
+    assert psnr > 30
     if not isinstance(method, lm.Fast):
         return
     flat = Dataset(
         Scan(data.train.geometry.flat, data.train.projections), Scan(data.test.geometry.flat, data.test.projections)
     )
-    assert found > lm.fit(flat, method, iterations=120, progress=False).metrics()['psnr_2d'] + 1
+    assert psnr > lm.fit(flat, method, iterations=120, progress=False).metrics()['psnr_2d'] + 1
     fit.save(tmp_path / 'fit')
-    assert json.loads((tmp_path / 'fit' / 'metrics.json').read_text())['psnr_2d'] == pytest.approx(found)
+    assert json.loads((tmp_path / 'fit' / 'metrics.json').read_text())['psnr_2d'] == pytest.approx(psnr)
     again = Fit.load(tmp_path / 'fit')
     assert isinstance(again.geometry, CurvedGeometry)
     np.testing.assert_array_equal(again.render(data.test.geometry), fit.render(data.test.geometry))
@@ -63,8 +63,8 @@ def test_the_scene_of_a_result_renders_it(data, tmp_path, no_report):
         assert isinstance(scanner.geometry, CurvedGeometry)
         for view in (0, 7):
             expected = fit.render(fit.geometry.subset([view]))[0]
-            found = np.array(mi.render(scene, sensor=scanner.view(view)))[..., 0]
-            np.testing.assert_allclose(found, expected, atol=2e-6 * expected.max())
+            image = np.array(mi.render(scene, sensor=scanner.view(view)))[..., 0]
+            np.testing.assert_allclose(image, expected, atol=2e-6 * expected.max())
 
 
 def test_what_needs_a_flat_panel(data):

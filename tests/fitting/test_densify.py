@@ -126,8 +126,8 @@ def test_halves_keep_mass_mean_and_covariance(flat):
     np.testing.assert_allclose(halves.mean(1), centre, atol=1e-6)
     half = (halves[:, 0] - halves[:, 1]) / 2
     assert not flat or not half[:, 2].any()
-    found = covariance(after)[10::2] + half[:, :, None] * half[:, None]
-    np.testing.assert_allclose(found, wanted, atol=1e-6)
+    actual = covariance(after)[10::2] + half[:, :, None] * half[:, None]
+    np.testing.assert_allclose(actual, wanted, atol=1e-6)
     for group in ('first', 'second'):
         for k in PARAMETERS:
             np.testing.assert_array_equal(getattr(after, group)[k][10:], getattr(state, group)[k][chosen].repeat(2, 0))

@@ -88,9 +88,9 @@ def test_absent_costs_nothing(monkeypatch, effects, changes):
     """Without effects to model, a fit launches the kernels of a step that has never heard of them, in their order."""
     scan = replace(tiny_scan(geometry(3)), effects=effects)
     method = SHORT.changed(iterations=5, densify_from=100, **changes)
-    found = kernels(lambda: run(scan, method, seed=3))
+    launched = kernels(lambda: run(scan, method, seed=3))
     monkeypatch.setattr(GaussianStepper, '_compare', plain_view)
-    assert found == kernels(lambda: run(scan, method, seed=3))
+    assert launched == kernels(lambda: run(scan, method, seed=3))
 
 
 @physics
@@ -169,24 +169,24 @@ def test_derivatives_by_differences(name):
         slope = np.array(dr.grad(values[key]))
         # A random way, but uphill in every number: a sum that cancels would drown in the rounding of the loss.
         way = (np.sign(slope) * np.abs(rng.normal(size=slope.shape))).astype(np.float32)
-        found = float((slope * way).sum())
+        slope_along = float((slope * way).sum())
         move = type(plain)(way)
         ahead, behind = (
             loss({k: dr.detach(v) for k, v in values.items()} | {key: plain + s * h * move}) for s in (1, -1)
         )
-        np.testing.assert_allclose(found, (ahead - behind) / (2 * h), rtol=2e-2, err_msg=key)
+        np.testing.assert_allclose(slope_along, (ahead - behind) / (2 * h), rtol=2e-2, err_msg=key)
 
 
 def test_derivatives_by_the_pose_through_bundles():
     """Bundles of a focal spot move with their view: the derivative by its source is that of one ray's, for a small spot."""
-    found = []
+    slopes = []
     for size in (0.0, 1e-3):
         stepper, state = stepper_of(Effects(None, FocalSpot((size, size), 2), None), rate_pose=(1e-3, 1e-4))
         target = stepper.targets[1]
         place(target.view, target.rays)
         stepper._compare(leaves(stepper.forward.gaussians(state.values)), target, 1)
-        found.append(gathered(target.view).ravel())
-    np.testing.assert_allclose(found[1], found[0], rtol=1e-3, atol=1e-3 * np.abs(found[0]).max())
+        slopes.append(gathered(target.view).ravel())
+    np.testing.assert_allclose(slopes[1], slopes[0], rtol=1e-3, atol=1e-3 * np.abs(slopes[0]).max())
 
 
 # ---- initial clouds, masks, checkpoints, results ---------------------------------------------------------------------
@@ -202,9 +202,9 @@ def test_hardening_is_inverted_for_initial_clouds():
     hard = replace(clean, projections=np.stack([bands.hardened(p) for p in clean.projections]), effects=effects)
     np.testing.assert_allclose(effects.without_hardening(hard.projections), clean.projections, atol=1e-5)
     method = SHORT.changed(start='masks', n_points=50, density='fdk')
-    expected, found = (method.starting_cloud(scan, seed=2) for scan in (clean, hard))
-    np.testing.assert_allclose(found.density, expected.density, rtol=1e-3)
-    np.testing.assert_allclose(found.points, expected.points)
+    expected, actual = (method.starting_cloud(scan, seed=2) for scan in (clean, hard))
+    np.testing.assert_allclose(actual.density, expected.density, rtol=1e-3)
+    np.testing.assert_allclose(actual.points, expected.points)
     ignored = method.changed(effects='ignore').starting_cloud(hard, seed=2)
     assert not np.allclose(ignored.density, expected.density, rtol=1e-2)
 
@@ -315,9 +315,9 @@ def test_what_a_fit_leaves_behind(tmp_path):
     image = np.array(mi.render(loaded.scene, sensor=loaded.scanner.view(0, test.geometry.subset([0]))))[..., 0]
     np.testing.assert_allclose(read_exr(tmp_path / 'model' / 'views' / '0000.exr'), image, atol=2e-3 * image.max())
     assert 'xray_tube' not in (tmp_path / 'ignore' / 'result.xml').read_text()
-    found = {e: json.loads((tmp_path / e / 'metrics.json').read_text()) for e in ('model', 'ignore')}
-    assert found['model']['settings']['effects'] == 'model'
-    assert found['ignore']['settings']['effects'] == 'ignore'
+    records = {e: json.loads((tmp_path / e / 'metrics.json').read_text()) for e in ('model', 'ignore')}
+    assert records['model']['settings']['effects'] == 'model'
+    assert records['ignore']['settings']['effects'] == 'ignore'
 
 
 @physics

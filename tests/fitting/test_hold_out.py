@@ -22,28 +22,28 @@ def blank(views, **changes):
 @pytest.mark.parametrize('views, every, held', [(60, None, 6), (20, None, 2), (19, None, 0), (60, 0, 0), (60, 4, 15)])
 def test_evenly_spaced_views_are_held_out(views, every, held):
     scan = blank(views)
-    found = with_held_out(Dataset(scan), every)
-    assert len(found.train) == views - held and (0 if found.test is None else len(found.test)) == held
+    split = with_held_out(Dataset(scan), every)
+    assert len(split.train) == views - held and (0 if split.test is None else len(split.test)) == held
     if held:
-        steps = np.diff(found.test.geometry.angles) / np.diff(scan.geometry.angles)[0]
+        steps = np.diff(split.test.geometry.angles) / np.diff(scan.geometry.angles)[0]
         np.testing.assert_allclose(steps, every or 10, rtol=1e-5)
-        angles = np.sort(np.concatenate([found.train.geometry.angles, found.test.geometry.angles]))
+        angles = np.sort(np.concatenate([split.train.geometry.angles, split.test.geometry.angles]))
         np.testing.assert_allclose(angles, scan.geometry.angles, rtol=1e-6)
-        assert not np.isin(scan.geometry.angles[[0, -1]], found.test.geometry.angles).any()
+        assert not np.isin(scan.geometry.angles[[0, -1]], split.test.geometry.angles).any()
 
 
 def test_nothing_is_held_out_of_what_has_a_truth_or_was_chosen_by_hand():
     scan = blank(60)
-    for given in (scan, Dataset(scan, scan), Dataset(scan, None, np.zeros((4, 4, 4)))):
-        assert len(with_held_out(given, None).train) == 60
+    for data in (scan, Dataset(scan, scan), Dataset(scan, None, np.zeros((4, 4, 4)))):
+        assert len(with_held_out(data, None).train) == 60
     assert len(with_held_out(scan, 10).test) == 6
 
 
 def test_a_view_without_a_valid_pixel_measures_nothing():
     valid = np.ones((60, 8, 24), bool)
     valid[5] = False
-    found = with_held_out(Dataset(replace(blank(60), valid=valid)), 10)
-    assert (len(found.train), len(found.test)) == (55, 5) and found.test.valid is None
+    split = with_held_out(Dataset(replace(blank(60), valid=valid)), 10)
+    assert (len(split.train), len(split.test)) == (55, 5) and split.test.valid is None
 
 
 @pytest.mark.parametrize(
@@ -62,10 +62,10 @@ def test_the_residual_of_a_right_answer_is_noise_alone():
     counts = rng.poisson(2e4 * np.exp(-truth))
     g = geometry(6, nDetector=(40, 400))
     scan = Scan(g, -np.log(counts / 2e4))
-    found = residual_numbers(truth, scan)
+    actual = residual_numbers(truth, scan)
     # The estimate of the noise is a median over 95 000 differences.
-    assert found['residual_to_noise'] == pytest.approx(1, abs=0.02)
-    assert found['residual_rms'] == pytest.approx(np.sqrt(np.exp(truth).mean() / 2e4), rel=0.02)
+    assert actual['residual_to_noise'] == pytest.approx(1, abs=0.02)
+    assert actual['residual_rms'] == pytest.approx(np.sqrt(np.exp(truth).mean() / 2e4), rel=0.02)
     wrong = truth.copy()
     wrong[2] += 0.1
     by_view = residual_numbers(wrong, scan)['residual_by_view']
@@ -78,15 +78,15 @@ def test_only_valid_pixels_count():
     valid = np.ones(scan.projections.shape, bool)
     valid[:, :, :12], valid[3] = False, False
     rendered = np.where(valid, 0.5, 9).astype(np.float32)
-    found = residual_numbers(rendered, replace(scan, valid=valid))
-    assert found['residual_rms'] == pytest.approx(0.5)
-    assert found['residual_by_view'] == [pytest.approx(0.5)] * 3 + [None]
+    actual = residual_numbers(rendered, replace(scan, valid=valid))
+    assert actual['residual_rms'] == pytest.approx(0.5)
+    assert actual['residual_by_view'] == [pytest.approx(0.5)] * 3 + [None]
 
 
 def test_a_fit_of_a_measured_scan_says_how_well_it_predicts(tmp_path):
     scan = tiny_scan(geometry(20))
-    found = fit(Dataset(scan), SHORT.changed(iterations=5), folder=tmp_path / 'out', progress=False)
-    numbers = found.record
+    fitted = fit(Dataset(scan), SHORT.changed(iterations=5), folder=tmp_path / 'out', progress=False)
+    numbers = fitted.record
     assert numbers['views'] == 18 and len(numbers['residual_by_view']) == 2 == len(numbers['test_angles'])
     assert 'held-out views  PSNR' in summary(numbers) and 'residual' in summary(numbers)
     page = (tmp_path / 'out' / 'report.html').read_text()

@@ -31,11 +31,11 @@ def few(method):
 def test_of_the_default(data):
     fit = run(data.train, few(lm.Fast()), seed=0)
     text = lingo_summary(fit)
-    found = re.fullmatch(r'masks at (\S+) and (\S+) keep (\S+) of 4,096 voxels; loss scale (\S+) to (\S+)', text)
-    high, low, kept, least, most = (float(x.replace(',', '')) for x in found.groups())
+    numbers = re.fullmatch(r'masks at (\S+) and (\S+) keep (\S+) of 4,096 voxels; loss scale (\S+) to (\S+)', text)
+    high, low, cells, least, most = (float(x.replace(',', '')) for x in numbers.groups())
     thresholds = masks(data.train.projections).t_high  # line integrals, as measured
     assert high == pytest.approx(thresholds.mean(), rel=0.01) and low == pytest.approx(0.1 * high, rel=0.01)
-    assert 0 < kept < 4096 and kept == fit.info['cells_low']
+    assert 0 < cells < 4096 and cells == fit.info['cells_low']
     t = np.array([otsu(image) for image in fit.render()]) * data.train.geometry.grid.scale / fit.model.unit
     factor = t + 0.25 / t
     assert (least, most) == (pytest.approx(factor.min(), rel=0.01), pytest.approx(factor.max(), rel=0.01))

@@ -168,10 +168,10 @@ def test_total_variation_is_of_every_nth_voxel(scan, stride):
     state = DeviceState(start_state(start.points.astype(np.float32), start.spacing, start.density, forward))
     gaussians = forward.gaussians(state.values)
     dr.enable_grad(gaussians)
-    found = random_cube_variation(gaussians, g, method.loss, method.extent, np.random.default_rng(0))[0]
+    actual = random_cube_variation(gaussians, g, method.loss, method.extent, np.random.default_rng(0))[0]
     volume = model.volume(state)[::stride, ::stride, ::stride] / model.unit
     wanted = np.concatenate([np.diff(volume, axis=i).ravel() for i in range(3)])
-    np.testing.assert_allclose(found, method.loss.lambda_tv * np.abs(wanted).mean(), rtol=1e-5)
+    np.testing.assert_allclose(actual, method.loss.lambda_tv * np.abs(wanted).mean(), rtol=1e-5)
 
 
 @pytest.mark.parametrize('batch', [1, 2])
@@ -184,13 +184,13 @@ def test_the_dynamic_factor_is_on_the_whole_loss(scan, batch, monkeypatch):
     monkeypatch.setattr(view_loss, 'loss_scale', lambda image: mi.Float(next(factors)))
 
     def gradients(views, **changes):
-        found = {}
-        monkeypatch.setattr(step, 'adam_step', lambda state, gradients, *_: found.update(gradients))
+        results = {}
+        monkeypatch.setattr(step, 'adam_step', lambda state, gradients, *_: results.update(gradients))
         stepper = SHORT.changed(tv_size=9, batch=batch, **changes).stepper(scan)
         state = DeviceState(stepper.begin(0)[0])
         with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
             stepper.step(state, views, 0, np.random.default_rng(7))
-        return {name: x.numpy() for name, x in found.items()}
+        return {name: x.numpy() for name, x in results.items()}
 
     views = list(range(batch))
     scaled = gradients(views, loss_scale='dynamic')
@@ -198,10 +198,10 @@ def test_the_dynamic_factor_is_on_the_whole_loss(scan, batch, monkeypatch):
     variation = {name: both[1][name] - both[0][name] for name in scaled}
     single = [gradients([view], lambda_tv=0.0, loss_scale='none') for view in views]
     for name in ('centre', 'density', 'scale'):  # spheres have no rotation
-        found = scaled[name]
+        results = scaled[name]
         wanted = sum(f * one[name] for f, one in zip((3, 5), single)) / batch + (3, 4)[batch - 1] * variation[name]
-        assert np.abs(variation[name]).max() > 1e-3 * np.abs(found).max(), name
-        np.testing.assert_allclose(found, wanted, rtol=2e-3, atol=1e-4 * np.abs(wanted).max(), err_msg=name)
+        assert np.abs(variation[name]).max() > 1e-3 * np.abs(results).max(), name
+        np.testing.assert_allclose(results, wanted, rtol=2e-3, atol=1e-4 * np.abs(wanted).max(), err_msg=name)
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -238,11 +238,11 @@ def test_replayed_steps_are_the_traced_ones(scan, changes, masked, sums_in_order
     method = SHORT.changed(iterations=20, densify_from=0, densify_every=5, **changes)
     if masked:
         scan = replace(scan, valid=np.random.default_rng(0).random(scan.projections.shape) > 0.1)
-    found = []
+    actual = []
     for frozen in (False, True):
         with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, frozen):
-            found.append(run(scan, method).state)
-    traced, replayed = found
+            actual.append(run(scan, method).state)
+    traced, replayed = actual
     assert len(traced) != 0 and len(traced) == len(replayed)
     for name, values in traced.values.items():
         assert np.array_equal(values, replayed.values[name]), name
@@ -296,9 +296,9 @@ def test_values_of_invalid_pixels_do_not_count(scan):
 def test_total_variation_beside_more_views(scan):
     """No more of it in n steps, one a view, from `tv_views` on; once only, when limits meet limits."""
     method = SHORT.changed(lambda_tv=0.3, tv_views=2)
-    found = method.bounded(scan)
-    assert len(scan) == 3 and found.loss.lambda_tv == pytest.approx(0.2)
-    assert found.bounded(scan) == found
+    actual = method.bounded(scan)
+    assert len(scan) == 3 and actual.loss.lambda_tv == pytest.approx(0.2)
+    assert actual.bounded(scan) == actual
     for other in (method.changed(tv_views=3), method.changed(tv_views=0)):
         assert other.bounded(scan).loss.lambda_tv == 0.3
 

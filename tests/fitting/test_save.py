@@ -25,13 +25,13 @@ def checkpoint(tmp_path_factory):
 
 def test_a_result_without_a_scan(checkpoint, tmp_path, no_report):
     fit = Fit.load(checkpoint)
-    found = json.loads((fit.save(tmp_path / 'out') / 'metrics.json').read_text())
-    assert Fit.load(tmp_path / 'out').record == found
-    assert found['psnr_2d'] is None and found['psnr_3d'] is None and found['test_angles'] == []
-    assert (found['seed'], found['views'], found['settings']['lambda_tv']) == (3, 3, SHORT.loss.lambda_tv)
+    record = json.loads((fit.save(tmp_path / 'out') / 'metrics.json').read_text())
+    assert Fit.load(tmp_path / 'out').record == record
+    assert record['psnr_2d'] is None and record['psnr_3d'] is None and record['test_angles'] == []
+    assert (record['seed'], record['views'], record['settings']['lambda_tv']) == (3, 3, SHORT.loss.lambda_tv)
     np.testing.assert_allclose(nibabel.load(tmp_path / 'out' / 'volume.nii.gz').get_fdata(), fit.volume(), rtol=1e-6)
     assert (tmp_path / 'out' / 'result.xml').exists() and not (tmp_path / 'out' / 'views').exists()
-    assert 'PSNR' not in summary(found) and 'n/a' not in summary(found)
+    assert 'PSNR' not in summary(record) and 'n/a' not in summary(record)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +63,7 @@ def test_the_held_out_views_of_the_summary_are_absolute(checkpoint):
 
 def test_a_result_with_what_it_is_compared_with(checkpoint, tmp_path, no_report):
     folder = compared(checkpoint).save(tmp_path / 'out', title='itself', note=dict(command='fit'))
-    found = json.loads((folder / 'metrics.json').read_text())
-    assert found['ssim_3d'] == pytest.approx(1) and found['psnr_2d'] > 0 and len(found['test_angles']) == 2
-    assert (found['method'], found['command']) == ('r2', 'fit')
+    record = json.loads((folder / 'metrics.json').read_text())
+    assert record['ssim_3d'] == pytest.approx(1) and record['psnr_2d'] > 0 and len(record['test_angles']) == 2
+    assert (record['method'], record['command']) == ('r2', 'fit')
     assert sorted(p.name for p in (folder / 'views').iterdir()) == ['0000.exr', '0001.exr']

@@ -97,13 +97,13 @@ def test_device_twin_agrees(n):
     state.values['density'][: n // 2] *= 30  # both ends of the softplus
     state.values['scale'][: n // 2] *= 6
     centre, scale, rotation, density = activate(state, FORWARD)
-    found = [np.array(x) for x in FORWARD.gaussians(DeviceState(state).values)]
-    np.testing.assert_array_equal(found[0].T, centre)
-    np.testing.assert_allclose(found[1].T, scale, rtol=2e-6)
-    q = found[2].T
+    values = [np.array(x) for x in FORWARD.gaussians(DeviceState(state).values)]
+    np.testing.assert_array_equal(values[0].T, centre)
+    np.testing.assert_allclose(values[1].T, scale, rtol=2e-6)
+    q = values[2].T
     np.testing.assert_allclose(q / np.linalg.norm(q, axis=1, keepdims=True), rotation, atol=1e-6)
     # 1 + exp(raw) rounds to 6e-8 in float32, all that is left of a density far below 1.
-    np.testing.assert_allclose(found[3], density, rtol=2e-6, atol=1e-7)
+    np.testing.assert_allclose(values[3], density, rtol=2e-6, atol=1e-7)
 
 
 def test_activation_derivatives():
@@ -166,11 +166,11 @@ def test_adam_against_numpy(nesterov):
             if nesterov:  # Dozat's
                 mean = 0.9 * m[k] / (1 - 0.9 ** (step + 1)) + 0.1 * g / (1 - 0.9**step)
             expected[k] -= rates[k] * mean / (np.sqrt(s[k] / (1 - 0.999**step)) + 1e-15)
-    found = device.host()
+    actual = device.host()
     for k in PARAMETERS:
-        np.testing.assert_allclose(found.values[k], expected[k], atol=1e-5 * rates[k] * 5 + 2e-6)
-        np.testing.assert_allclose(found.first[k], m[k], rtol=1e-5, atol=1e-7)
-        np.testing.assert_allclose(found.second[k], s[k], rtol=1e-4, atol=1e-12)
+        np.testing.assert_allclose(actual.values[k], expected[k], atol=1e-5 * rates[k] * 5 + 2e-6)
+        np.testing.assert_allclose(actual.first[k], m[k], rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(actual.second[k], s[k], rtol=1e-4, atol=1e-12)
 
 
 def test_adam_without_a_derivative_stays_finite():

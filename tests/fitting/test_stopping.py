@@ -98,18 +98,18 @@ def test_resumed_it_is_the_same(scan, whole, tmp_path, where, sums_in_order):
 
 def test_the_search_has_the_rates_of_the_fit(scan, monkeypatch):
     """Those of alpha compositing are in units of the radius of the scene, which fewer views tell a little otherwise."""
-    given, searched = METHODS['3dgs'].changed(stop='on'), []
+    splatting, searched = METHODS['3dgs'].changed(stop='on'), []
 
-    def running(scan, seen, method, seed, stored, search, own):
-        searched.append(own.stepper(seen).method)
+    def running(scan, seen, method, seed, stored, search, search_method):
+        searched.append(search_method.stepper(seen).method)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(loop, 'Running', running)
     with pytest.raises(KeyboardInterrupt):
-        run(scan, given)
-    used = given.bounded(scan).stepper(scan).method.rates.rate_centre
+        run(scan, splatting)
+    used = splatting.bounded(scan).stepper(scan).method.rates.rate_centre
     assert searched[0].rates.rate_centre == pytest.approx(used, rel=0.1)
-    assert used[0] > 2 * given.rates.rate_centre[0]
+    assert used[0] > 2 * splatting.rates.rate_centre[0]
 
 
 def test_what_is_told(scan, whole):
@@ -123,8 +123,8 @@ def test_what_is_told(scan, whole):
 
 
 def test_a_search_to_the_end(scan):
-    found = run(scan, METHOD.changed(iterations=20), seed=3)
-    assert found.steps == 20 and sentence(found.search) == 'took all 20 steps: the held-out error fell to the end'
+    fitted = run(scan, METHOD.changed(iterations=20), seed=3)
+    assert fitted.steps == 20 and sentence(fitted.search) == 'took all 20 steps: the held-out error fell to the end'
 
 
 def test_auto_is_for_scans_whose_noise_is_known(scan):

@@ -26,9 +26,9 @@ def test_every_view_once(order, n):
 def test_golden_views_in_a_row_lie_apart(turn, n):
     """By Steinhaus' three gaps, a few multiples of the golden section divide the circle nearly evenly."""
     angles = np.random.default_rng(1).permutation(turn * np.arange(n) / n)  # in any order of the views
-    found = angles[view_order(circle(angles), 'golden', np.random.default_rng(2))]
+    ordered = angles[view_order(circle(angles), 'golden', np.random.default_rng(2))]
     for k in (2, 3, 5, 8):
-        rows = np.sort(np.lib.stride_tricks.sliding_window_view(found, k), 1)
+        rows = np.sort(np.lib.stride_tricks.sliding_window_view(ordered, k), 1)
         assert np.diff(rows).min() >= 0.35 * turn / k
 
 

@@ -101,8 +101,8 @@ def differentiated(kind, function, values, weights):
     return out, [x.grad for x in arrays]
 
 
-def assert_derivatives(found, expected):
-    for name, derivative in zip(NAMES, found):
+def assert_derivatives(actual, expected):
+    for name, derivative in zip(NAMES, actual):
         assert relative(host(derivative), expected[name]) < 1e-5, name
 
 
@@ -122,20 +122,20 @@ def views(request):
 def test_images(kind, views):
     g, cloud, _, expected, _ = views
     arrays = arrays_of(kind, columns(cloud))
-    found = project(*arrays, g, extent=EXTENT)
-    assert type(found) is {'numpy': np.ndarray, 'drjit': mi.TensorXf}.get(kind, type(arrays[0]))
-    assert str(found.dtype).endswith('float32') if kind != 'drjit' else True
-    assert relative(host(found), expected) < 2e-6
+    image = project(*arrays, g, extent=EXTENT)
+    assert type(image) is {'numpy': np.ndarray, 'drjit': mi.TensorXf}.get(kind, type(arrays[0]))
+    assert str(image.dtype).endswith('float32') if kind != 'drjit' else True
+    assert relative(host(image), expected) < 2e-6
     some = project(*arrays, g, extent=EXTENT, views=[2, -3])
-    assert_same(host(some), host(found)[[2, 0]])
+    assert_same(host(some), host(image)[[2, 0]])
 
 
 @pytest.mark.parametrize('kind', DIFFERENTIABLE)
 def test_derivatives_of_images(kind, views):
     g, cloud, weights, expected, derivatives = views
-    out, found = differentiated(kind, lambda *x: project(*x, g, extent=EXTENT), columns(cloud), weights)
+    out, actual = differentiated(kind, lambda *x: project(*x, g, extent=EXTENT), columns(cloud), weights)
     assert relative(host(out), expected) < 2e-6
-    assert_derivatives(found, derivatives)
+    assert_derivatives(actual, derivatives)
 
 
 def test_the_closed_form_agrees():
@@ -143,11 +143,11 @@ def test_the_closed_form_agrees():
     g, cloud = scan(), gaussians()
     weights = np.random.default_rng(3).normal(size=g.nDetector)
     image, expected = image_and_gradients([getattr(cloud, n) for n in NAMES], g.rays()[[1]], g.nDetector, weights)
-    out, found = differentiated(
+    out, actual = differentiated(
         'drjit', lambda *x: project(*x, g, extent=EXTENT, views=[1]), columns(cloud), weights[None]
     )
     assert relative(host(out), image) < 2e-6
-    assert_derivatives(found, expected)
+    assert_derivatives(actual, expected)
 
 
 @pytest.mark.parametrize('kind', KINDS)
@@ -164,8 +164,8 @@ def test_voxels(kind, nVoxel):
     if kind == 'numpy':
         out = grid(*columns(cloud))
     else:
-        out, found = differentiated(kind, grid, columns(cloud), weights)
-        assert_derivatives(found, oracle.value_gradients(cloud, points, weights.ravel()))
+        out, actual = differentiated(kind, grid, columns(cloud), weights)
+        assert_derivatives(actual, oracle.value_gradients(cloud, points, weights.ravel()))
     assert tuple(out.shape) == nVoxel
     assert relative(host(out), oracle.values_at(cloud, points)) < 2e-6
 
@@ -186,9 +186,9 @@ def test_dr_jit_vectors(views):
 def test_literals():
     """Arrays of one number repeated, which Dr.Jit does not store."""
     equal = [mi.TensorXf(x) for x in (np.zeros((5, 3)), np.full((5, 3), 9), np.tile([0, 0, 0, 1], (5, 1)))]
-    found = project(*equal, dr.full(mi.TensorXf, 0.2, 5), scan())
+    image = project(*equal, dr.full(mi.TensorXf, 0.2, 5), scan())
     one = project(np.zeros((1, 3)), np.full((1, 3), 9), [[0, 0, 0, 1]], [1.0], scan())
-    np.testing.assert_allclose(found.numpy(), one, rtol=1e-5)
+    np.testing.assert_allclose(image.numpy(), one, rtol=1e-5)
 
 
 def test_a_virtual_panel_at_the_axis():
@@ -229,15 +229,15 @@ def test_float64(kind):
         with module.enable_x64(True):
             arrays = [module.numpy.asarray(x, dtype='float64') for x in values]
             assert arrays[0].dtype == 'float64'
-            found = project(*arrays, g)
+            image = project(*arrays, g)
             slopes = module.grad(lambda m: project(m, *arrays[1:], g).sum())(arrays[0])
     else:
         arrays = [module.tensor(x, dtype=module.float64, device=_device(), requires_grad=True) for x in values]
-        found = project(*arrays, g)
-        found.sum().backward()
+        image = project(*arrays, g)
+        image.sum().backward()
         slopes = arrays[0].grad
-    assert str(found.dtype).endswith('float32') and str(slopes.dtype).endswith('float64')
-    np.testing.assert_allclose(host(found), expected, rtol=1e-5, atol=1e-6)
+    assert str(image.dtype).endswith('float32') and str(slopes.dtype).endswith('float64')
+    np.testing.assert_allclose(host(image), expected, rtol=1e-5, atol=1e-6)
 
 
 def test_torch_parameters_and_no_grad():
@@ -272,8 +272,8 @@ def test_within_a_jitted_function_of_jax():
         return (project(*x, g, views=[0, 1]) ** 2).sum() + voxelize(*x, g).sum()
 
     expected = jax.value_and_grad(loss, argnums=(0, 1, 2, 3))(*arrays)
-    found = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2, 3)))(*arrays)
-    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected)):
+    actual = jax.jit(jax.value_and_grad(loss, argnums=(0, 1, 2, 3)))(*arrays)
+    for a, b in zip(jax.tree.leaves(actual), jax.tree.leaves(expected)):
         np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-6 * (np.abs(b).max() if adds_in_any_order() else 1))
 
 
@@ -297,8 +297,8 @@ def test_a_training_loop_in_torch():
     optimiser = torch.optim.Adam([dict(params=[p], lr=rate) for p, rate in rates])
 
     def error():
-        found = voxelize(*(x.detach() for x in cloud()), g)
-        return relative(host(found), grid)
+        volume = voxelize(*(x.detach() for x in cloud()), g)
+        return relative(host(volume), grid)
 
     def cloud():
         return means, log_scales.exp(), quaternions, log_density.exp()
@@ -333,8 +333,8 @@ def test_nothing_is_compiled_anew():
             dr.sync_thread()
             return {k['hash'] for k in dr.kernel_history((dr.KernelType.JIT,))}
 
-    known = run(12, [0]) | run(12, [0])  # what is recorded is traced a little differently from what is replayed
-    assert run(12, [1]) <= known and run(9, [2]) <= known and run(9, [0]) <= known
+    kernels = run(12, [0]) | run(12, [0])  # what is recorded is traced a little differently from what is replayed
+    assert run(12, [1]) <= kernels and run(9, [2]) <= kernels and run(9, [0]) <= kernels
 
 
 GOOD = [np.zeros((4, 3)), np.ones((4, 3)), np.tile([0.0, 0, 0, 1], (4, 1)), np.ones(4)]
@@ -443,10 +443,10 @@ geometry = Geometry.cone(
 )
 print(project(*cloud, geometry).shape, voxelize(*cloud, geometry).shape, *sorted({{'torch', 'jax'}} & set(sys.modules)))
 """
-    found = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
-    assert found.returncode == 0, found.stderr
+    process = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True)
+    assert process.returncode == 0, process.stderr
     shapes = 'torch.Size([2, 8, 9]) torch.Size([4, 5, 6])' if kind == 'torch' else '(2, 8, 9) (4, 5, 6)'
-    assert found.stdout.split('\n')[0] == shapes + ('' if kind == 'numpy' else f' {kind}')
+    assert process.stdout.split('\n')[0] == shapes + ('' if kind == 'numpy' else f' {kind}')
 
 
 def test_twice_through_one_graph_of_torch():
@@ -487,8 +487,8 @@ def test_jacobian_of_torch():
     def pixels(density):
         return project(*arrays[:3], density, scan(), views=[0])[0, :2, :2].ravel()
 
-    found = torch.autograd.functional.jacobian(pixels, arrays[3])
-    for i, row in enumerate(found):
+    jacobian = torch.autograd.functional.jacobian(pixels, arrays[3])
+    for i, row in enumerate(jacobian):
         density = arrays[3].clone().requires_grad_()
         pixels(density)[i].backward()
         assert_same(host(row), host(density.grad))
@@ -499,8 +499,8 @@ def test_calls_from_several_threads(kind):
     arrays = arrays_of(kind, columns(gaussians()))
     expected = host(project(*arrays, scan(), views=[0]))
     with ThreadPoolExecutor(4) as pool:
-        for found in pool.map(lambda _: project(*arrays, scan(), views=[0]), range(12)):
-            assert_same(host(found), expected)
+        for actual in pool.map(lambda _: project(*arrays, scan(), views=[0]), range(12)):
+            assert_same(host(actual), expected)
 
 
 def test_variant(variant):

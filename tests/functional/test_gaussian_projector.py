@@ -55,17 +55,17 @@ def test_kinds_of_arrays(kind):
     expected = A.T(A(x) - y)
     close = dict(rtol=1e-4, atol=1e-4 * np.abs(expected).max())
     if kind == 'jax':
-        found = module.grad(lambda x: ((A(x) - y) ** 2).sum() / 2)(module.numpy.asarray(x))
-        np.testing.assert_allclose(found, expected, **close)
+        actual = module.grad(lambda x: ((A(x) - y) ** 2).sum() / 2)(module.numpy.asarray(x))
+        np.testing.assert_allclose(actual, expected, **close)
         return
-    given = mi.TensorXf(x) if kind == 'drjit' else module.tensor(x, requires_grad=True)
+    array = mi.TensorXf(x) if kind == 'drjit' else module.tensor(x, requires_grad=True)
     if kind == 'drjit':
-        dr.enable_grad(given)
-        dr.backward(dr.sum(dr.square(A(given) - mi.TensorXf(y)), axis=None) / 2)
-        np.testing.assert_allclose(dr.grad(given).numpy(), expected, **close)
+        dr.enable_grad(array)
+        dr.backward(dr.sum(dr.square(A(array) - mi.TensorXf(y)), axis=None) / 2)
+        np.testing.assert_allclose(dr.grad(array).numpy(), expected, **close)
         return
-    ((A(given) - module.tensor(y)) ** 2).sum().backward()
-    np.testing.assert_allclose(given.grad / 2, expected, **close)
+    ((A(array) - module.tensor(y)) ** 2).sum().backward()
+    np.testing.assert_allclose(array.grad / 2, expected, **close)
 
 
 @pytest.mark.parametrize(

@@ -107,23 +107,23 @@ def test_kinds_of_arrays(kind, batch):
     A = Projector(GEOMETRIES['cone'])
     x, y = pair((*batch, *A.domain_shape), (*batch, *A.range_shape))
     for linear_map, values in ((A, x), (A.T, y)):
-        given = array_of(kind, values)
-        found = linear_map(given)
+        array = array_of(kind, values)
+        actual = linear_map(array)
         wanted = np.array([linear_map(v) for v in values.reshape(-1, *linear_map.domain_shape)])
-        assert isinstance(found, type(given)) and host(found).dtype == np.float32
+        assert isinstance(actual, type(array)) and host(actual).dtype == np.float32
         np.testing.assert_allclose(
-            host(found), wanted.reshape(*batch, *linear_map.range_shape), atol=1e-6 * np.abs(wanted).max()
+            host(actual), wanted.reshape(*batch, *linear_map.range_shape), atol=1e-6 * np.abs(wanted).max()
         )
     if kind == 'torch':
-        assert found.device == given.device and found.is_contiguous()
+        assert actual.device == array.device and actual.is_contiguous()
 
 
 def test_flat_arrays_of_drjit():
     A = Projector(GEOMETRIES['cone'])
     x, _ = pair(A.domain_shape, A.range_shape)
-    found = A(mi.Float(x.ravel()))
-    assert isinstance(found, mi.Float)
-    np.testing.assert_array_equal(found.numpy(), A(x).ravel())
+    actual = A(mi.Float(x.ravel()))
+    assert isinstance(actual, mi.Float)
+    np.testing.assert_array_equal(actual.numpy(), A(x).ravel())
     np.testing.assert_array_equal(A(dr.ones(mi.TensorXf, A.domain_shape)).numpy(), A(np.ones(A.domain_shape)))
 
 
@@ -137,8 +137,8 @@ def test_derivatives_of_drjit():
     tensor = mi.TensorXf(x)
     dr.enable_grad(tensor)
     dr.set_grad(tensor, 2.0)
-    found = dr.forward_to(A(tensor))
-    np.testing.assert_allclose(found.numpy(), A(np.full_like(x, 2)), rtol=1e-5, atol=1e-4)
+    change = dr.forward_to(A(tensor))
+    np.testing.assert_allclose(change.numpy(), A(np.full_like(x, 2)), rtol=1e-5, atol=1e-4)
 
 
 def test_derivatives_of_torch():
@@ -265,8 +265,8 @@ def test_norm_and_scipy():
     np.testing.assert_allclose(op.H @ np.eye(op.shape[0], dtype=np.float32), matrix.T, atol=1e-5)
     x, _ = pair(A.domain_shape, A.range_shape)
     b = A(x).ravel()
-    found = lsqr(op, b, iter_lim=300)[0]
-    assert np.linalg.norm(op @ found - b) < 1e-2 * np.linalg.norm(b)
+    solution = lsqr(op, b, iter_lim=300)[0]
+    assert np.linalg.norm(op @ solution - b) < 1e-2 * np.linalg.norm(b)
     tiny = Projector(scan(n=3, nVoxel=(2, 1, 1)))
     matrix = tiny.aslinearoperator() @ np.eye(2, dtype=np.float32)
     assert tiny.norm() == pytest.approx(np.linalg.norm(matrix, 2), rel=1e-5)

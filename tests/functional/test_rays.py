@@ -90,7 +90,7 @@ def test_images_of_clouds(scan):
     def images(rays):
         return project(*tensors, scan, extent=EXTENT, rays=rays)
 
-    found = by_reverse(images, vectors, weights)
+    actual = by_reverse(images, vectors, weights)
     names = 'source', 'corner', 'u', 'v'
     expected = []
     for i in range(2):
@@ -98,11 +98,11 @@ def test_images_of_clouds(scan):
         expected.append([parts[name] for name in names])
     expected = tangential(np.array(expected), scan)
     for i, name in enumerate(names):
-        assert relative(found[:, i], expected[:, i]) < 2e-4, name
+        assert relative(actual[:, i], expected[:, i]) < 2e-4, name
     for change in directions(scan):
         along = by_forward(images, vectors, change)
         assert (along * weights).sum() == pytest.approx(
-            (found * change).sum(), abs=1e-5 * np.abs(along * weights).sum()
+            (actual * change).sum(), abs=1e-5 * np.abs(along * weights).sum()
         )
 
 
@@ -122,11 +122,11 @@ def test_joseph(scan):
 
     for change in directions(scan, 1):
         expected = (exact(vectors + 1e-6 * change) - exact(vectors - 1e-6 * change)) / 2e-6
-        found = by_forward(lambda rays: A(tensor, rays=rays), vectors, change)
+        actual = by_forward(lambda rays: A(tensor, rays=rays), vectors, change)
         # Rays that pass a kink of the interpolant within a few ten-thousandths of a voxel have the mean of its two slopes.
-        assert np.quantile(np.abs(found - expected), 0.9) < 1e-4 * np.abs(expected).max()
-        assert relative(found, expected) < 2e-2
-        assert (found * weights).sum() == pytest.approx((gradient * change).sum(), abs=1e-4 * np.abs(found).sum())
+        assert np.quantile(np.abs(actual - expected), 0.9) < 1e-4 * np.abs(expected).max()
+        assert relative(actual, expected) < 2e-2
+        assert (actual * weights).sum() == pytest.approx((gradient * change).sum(), abs=1e-4 * np.abs(actual).sum())
 
 
 @each_scan
@@ -140,11 +140,11 @@ def test_the_exact_model(scan):
         A, tensor = Projector(some, model='exact'), mi.TensorXf(x)
         np.testing.assert_array_equal(A(x, rays=vectors), A(x))
         for change in directions(some):
-            found = by_forward(lambda rays: A(tensor, rays=rays), vectors, change)
+            actual = by_forward(lambda rays: A(tensor, rays=rays), vectors, change)
             ends = [A(x, rays=vectors + h * change).astype(float) for h in (0.01, -0.01)]
-            assert relative(found, (ends[0] - ends[1]) / 0.02) < 3e-3
-            gradient = by_reverse(lambda rays: A(tensor, rays=rays), vectors, found)
-            assert (gradient * change).sum() == pytest.approx((found**2).sum(), rel=1e-5)
+            assert relative(actual, (ends[0] - ends[1]) / 0.02) < 3e-3
+            gradient = by_reverse(lambda rays: A(tensor, rays=rays), vectors, actual)
+            assert (gradient * change).sum() == pytest.approx((actual**2).sum(), rel=1e-5)
 
 
 def test_volume_and_rays_together():
@@ -177,9 +177,9 @@ def moved(rays, motion):
 def registered(images, measured, rays, common):
     """The motion of all views together, or of each, that a gradient method finds from none."""
     target = mi.TensorXf(measured)
-    found = rays
+    estimate = rays
     for _ in range(2):  # derivatives are by a small motion: start again from what was found
-        begun = found
+        begun = estimate
 
         def loss(step, begun=begun):
             here = moved(begun, step * scale)
@@ -192,11 +192,11 @@ def registered(images, measured, rays, common):
 
         scale = np.tile([0.02, 0.02, 0.02, 1, 1, 1], 1 if common else len(rays))  # radians are longer than millimetres
         step = minimize(loss, np.zeros(len(scale)), jac=True, method='L-BFGS-B', options=dict(maxiter=22)).x * scale
-        found = moved(begun, step)
-    return found
+        estimate = moved(begun, step)
+    return estimate
 
 
-def known():
+def true_object():
     """A known object: voxels of three blobs, and the same as a cloud."""
     grid = Grid((20, 20, 20), 2.0)
     means = np.array([[8.0, 3, -5], [-6, 7, 4], [0, -9, 6]], np.float32)
@@ -211,7 +211,7 @@ def known():
 @pytest.mark.parametrize('of', ['cloud', 'voxels'])
 def test_a_shift_and_a_turn_are_recovered(of, common):
     """Half a millimetre and one degree, of all views together or of each, to a fiftieth of that."""
-    (grid, cloud, values), views = known(), 2
+    (grid, cloud, values), views = true_object(), 2
     scan = Geometry.cone(
         DSO=300, DSD=450, nDetector=(16, 16), dDetector=3.75, angles=np.linspace(0.2, 2.2, views), grid=grid
     )
@@ -223,14 +223,14 @@ def test_a_shift_and_a_turn_are_recovered(of, common):
     if of == 'cloud':
         tensors = [mi.TensorXf(x) for x in cloud]
         measured = project(*cloud, scan, rays=true.vectors)
-        found = registered(lambda rays: project(*tensors, scan, rays=rays), measured, scan.rays(), common)
+        recovered = registered(lambda rays: project(*tensors, scan, rays=rays), measured, scan.rays(), common)
     else:
         A, tensor = Projector(scan, model='exact'), mi.TensorXf(values)
         measured = A(values, rays=true.vectors)
-        found = registered(lambda rays: A(tensor, rays=rays), measured, scan.rays(), common)
-    before, after = (np.linalg.norm(r.source - true.source, axis=1).max() for r in (scan.rays(), found))
+        recovered = registered(lambda rays: A(tensor, rays=rays), measured, scan.rays(), common)
+    before, after = (np.linalg.norm(r.source - true.source, axis=1).max() for r in (scan.rays(), recovered))
     assert before > 2 and after < 0.02 * before
-    turn = np.linalg.norm(found.u - true.u, axis=1).max() / np.linalg.norm(scan.rays().u[0])
+    turn = np.linalg.norm(recovered.u - true.u, axis=1).max() / np.linalg.norm(scan.rays().u[0])
     assert turn < 0.02 * np.radians(1)
 
 

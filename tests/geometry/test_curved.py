@@ -221,9 +221,9 @@ def test_scan_files(curved, tmp_path):
         write_scan(
             tmp_path / name, Dataset(scan.subset([0, 2, 3, 4]), scan.subset([1])) if kind == 'exr' else scan, kind
         )
-        found = read_scan(tmp_path / name)
-        again = found.train.geometry.joined(found.test.geometry) if found.test else found.train.geometry
-        order = [0, 2, 3, 4, 1] if found.test else range(5)
+        read = read_scan(tmp_path / name)
+        again = read.train.geometry.joined(read.test.geometry) if read.test else read.train.geometry
+        order = [0, 2, 3, 4, 1] if read.test else range(5)
         assert isinstance(again, CurvedGeometry) and again.radius == curved.radius
         for i, view in enumerate(order):
             np.testing.assert_allclose(
@@ -249,10 +249,10 @@ offDetector: [0, 1.5]
 def test_the_name_in_a_geometry_file(tmp_path):
     np.save(tmp_path / 'scan.npy', np.zeros((2, 12, 30), np.float32))
     (tmp_path / 'scan.yml').write_text(CLINICAL + 'radius: 450\n')
-    found = read_scan(tmp_path / 'scan.npy').train.geometry
+    geometry = read_scan(tmp_path / 'scan.npy').train.geometry
     expected = flat(angles=np.radians([0, 50]), offDetector=(0, 1.5)).curved()
     np.testing.assert_allclose(
-        found.rays(curved=True).project(POINTS, 1), expected.rays(curved=True).project(POINTS, 1)
+        geometry.rays(curved=True).project(POINTS, 1), expected.rays(curved=True).project(POINTS, 1)
     )
     for line, message in {
         'radius: -450': 'radius must be positive',
@@ -293,20 +293,20 @@ def test_resampling_converges(curved, fine, error):
     rays = replace(rays, corner=rays.corner - rows * rays.v - columns / 2 * rays.u, u=rays.u / fine, v=rays.v / fine)
     level = Geometry.from_poses(rays, (3 * rows * fine, 2 * columns * fine), grid=GRID)
     g = CurvedGeometry(flat=level, radius=curved.radius)
-    found = smooth(g).to_flat()
-    expected = smooth(found.geometry)
-    assert not isinstance(found.geometry, CurvedGeometry) and found.valid is None
-    assert np.abs(found.projections - expected.projections).max() < error
-    np.testing.assert_allclose(found.geometry.dDetector, step, rtol=1e-9)
+    actual = smooth(g).to_flat()
+    expected = smooth(actual.geometry)
+    assert not isinstance(actual.geometry, CurvedGeometry) and actual.valid is None
+    assert np.abs(actual.projections - expected.projections).max() < error
+    np.testing.assert_allclose(actual.geometry.dDetector, step, rtol=1e-9)
 
 
 def test_resampling_keeps_flat_scans_and_masks():
     g = flat().curved()
     scan = bodies(g)
     masked = replace(scan, valid=np.indices(scan.projections.shape)[2] != 14)
-    found, (_, _, left, _) = masked.to_flat(), g.flat_pixels()
-    x, _ = g.rays(curved=True).curve.on_panel(np.arange(found.projections.shape[2]) + left + 0.5, 6.0, 0)
-    np.testing.assert_array_equal(found.valid[0, 0], np.abs(x - 14.5) >= 1)
+    actual, (_, _, left, _) = masked.to_flat(), g.flat_pixels()
+    x, _ = g.rays(curved=True).curve.on_panel(np.arange(actual.projections.shape[2]) + left + 0.5, 6.0, 0)
+    np.testing.assert_array_equal(actual.valid[0, 0], np.abs(x - 14.5) >= 1)
     there = bodies(flat())
     assert there.to_flat() is there
     assert (

@@ -39,22 +39,22 @@ def test_parts_lie_on_the_canvas_and_are_to_scale(mode):
     )
     corner, u, v = geometry.rays().corner[0], 40 * geometry.rays().u[0], 30 * geometry.rays().v[0]
     panel = np.array([corner, corner + u, corner + u + v, corner + v])
-    for i, (sources, found, box, rays) in enumerate(parts(geometry)):
+    for i, (sources, drawn, box, rays) in enumerate(parts(geometry)):
         axes = [0, 1 + i]
-        everything = np.concatenate([sources, found, box])
+        everything = np.concatenate([sources, drawn, box])
         assert (everything.min(0) >= [i * WIDTH, 14]).all() and (everything.max(0) <= [(i + 1) * WIDTH, HEIGHT]).all()
         across, up = np.ptp(box, axis=0)
         scale = across / 40  # pixels per mm
         assert up / scale == pytest.approx((60, 20)[i], abs=0.2 / scale)
         seen = panel[:, axes] * [scale, -scale]
-        np.testing.assert_allclose(found[1:4] - found[0], seen[1:] - seen[0], atol=0.15)
+        np.testing.assert_allclose(drawn[1:4] - drawn[0], seen[1:] - seen[0], atol=0.15)
         for begin, end in rays:
             if mode == 'cone':
                 np.testing.assert_allclose(begin, sources[0])
             else:  # along the beam, from the plane that the dot stands for
                 beam = geometry.rays().source[0][axes] * [1, -1]
                 length = np.linalg.norm(beam)
-                along, dot = (end - begin) @ beam, (found[0] + found[2]) / 2 - sources[0]
+                along, dot = (end - begin) @ beam, (drawn[0] + drawn[2]) / 2 - sources[0]
                 if length > 0.1:
                     assert along / length == pytest.approx(dot @ beam / length, abs=1)
                     assert np.linalg.norm(end - begin) == pytest.approx(along / length, abs=1)

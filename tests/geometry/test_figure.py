@@ -43,8 +43,8 @@ def test_parts_are_where_they_are(scan):
     assert isinstance(figure, Figure) and (above.get_xlabel(), above.get_ylabel()) == ('x, mm', 'y, mm')
     assert above.get_aspect() == side.get_aspect() == 1
     first, other = panel_of(scan, 2), panel_of(scan, 0)
-    for found, expected in zip(lines(above, PANEL, 2.5), (other, first)):  # the strongest last
-        np.testing.assert_allclose(found, expected[:, :2])
+    for actual, expected in zip(lines(above, PANEL, 2.5), (other, first)):  # the strongest last
+        np.testing.assert_allclose(actual, expected[:, :2])
     (panel,) = lines(side, PANEL, 2.5)
     np.testing.assert_allclose(panel[:, 1], first[:, 2])
     if scan is not SCANS['flat panel']:  # seen along the panel, which stands beyond the volume or at its axis
@@ -105,5 +105,5 @@ def test_matplotlib_is_loaded_late_and_without_windows():
         'Geometry.parallel(nDetector=8, dDetector=1, nVoxel=8, dVoxel=1, angles=[0.0]).show(); '
         'print("matplotlib.pyplot" in sys.modules)'
     )
-    found = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True)
-    assert found.stdout.split() == ['False', 'False']
+    process = subprocess.run([sys.executable, '-c', program], capture_output=True, text=True, check=True)
+    assert process.stdout.split() == ['False', 'False']

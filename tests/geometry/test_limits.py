@@ -90,8 +90,8 @@ def variants(value, name):
 def test_one_extreme_number(beam, name):
     make, numbers, _ = BEAMS[beam]
     for value in EXTREME:
-        for given in variants(value, name):
-            finite_or_refused(lambda: make(**{**numbers, name: given}))
+        for extreme in variants(value, name):
+            finite_or_refused(lambda: make(**{**numbers, name: extreme}))
 
 
 @pytest.mark.parametrize('beam', BEAMS)
@@ -130,7 +130,7 @@ def test_poses():
 
 
 def test_matrices():
-    known = to_matrices(Geometry.cone(**CONE).rays())
+    sound = to_matrices(Geometry.cone(**CONE).rays())
 
     def check(matrices):
         finite_or_refused(
@@ -139,11 +139,11 @@ def test_matrices():
 
     for value in EXTREME:
         for row, column in itertools.product(range(3), range(4)):
-            matrices = known.astype(object)
+            matrices = sound.astype(object)
             matrices[1, row, column] = value
             check(matrices)
         if isinstance(value, float) and 0 < abs(value) < 1e90:
-            check(known * value)
+            check(sound * value)
 
 
 TIGRE = dict(
@@ -163,11 +163,11 @@ VOLUME = dict(
 @pytest.mark.parametrize('name', TIGRE)
 def test_tigre(name):
     for value in EXTREME:
-        for given in variants(value, name):
-            finite_or_refused(lambda: Geometry.from_tigre({**TIGRE, name: given}, [0.0, 1.0]))
+        for extreme in variants(value, name):
+            finite_or_refused(lambda: Geometry.from_tigre({**TIGRE, name: extreme}, [0.0, 1.0]))
             if name[0] == 'd':
                 rest = {k: v for k, v in TIGRE.items() if k != name}
-                finite_or_refused(lambda: Geometry.from_tigre({**rest, 's' + name[1:]: given}, [0.0, 1.0]))
+                finite_or_refused(lambda: Geometry.from_tigre({**rest, 's' + name[1:]: extreme}, [0.0, 1.0]))
     for value in EXTREME:
         finite_or_refused(lambda: Geometry.from_tigre(TIGRE, value))
 

@@ -122,9 +122,9 @@ def test_rtk_reads_the_geometry(name, tmp_path):
     g = geometry(name)
     if g.mode == 'parallel':
         pytest.skip('a parallel beam has no source')
-    known = RTK(g, tmp_path).geometry
-    found = [np.array(known.GetSourcePosition(view))[[2, 0, 1]] for view in range(len(g))]
-    np.testing.assert_allclose(found, g.rays(curved=True).source, atol=1e-9)
+    rtk_geometry = RTK(g, tmp_path).geometry
+    sources = [np.array(rtk_geometry.GetSourcePosition(view))[[2, 0, 1]] for view in range(len(g))]
+    np.testing.assert_allclose(sources, g.rays(curved=True).source, atol=1e-9)
 
 
 def test_ellipsoids_are_exact(name, tmp_path):
@@ -202,6 +202,6 @@ def test_a_ct_agrees_to_second_order(name, tmp_path, abdomen):
 def test_joseph_is_rtks(name, tmp_path, abdomen):
     g = bent(name, CircularGeometry(**wide(name), grid=Grid(abdomen.shape, 6.0)))
     expected = RTK(g, tmp_path).volume(abdomen)
-    found = Joseph(g).forward(mi.Float(abdomen.ravel()), range(len(g)))[0].numpy()
-    found = found.reshape(len(g), *SHAPE[::-1]).transpose(0, 2, 1)
-    assert np.abs(found - expected).max() < 1e-5 * expected.max()
+    actual = Joseph(g).forward(mi.Float(abdomen.ravel()), range(len(g)))[0].numpy()
+    actual = actual.reshape(len(g), *SHAPE[::-1]).transpose(0, 2, 1)
+    assert np.abs(actual - expected).max() < 1e-5 * expected.max()

@@ -39,6 +39,6 @@ def test_a_mesh_over_the_edge_of_the_grid():
     for axis in range(3):
         size, middle = np.full(3, 20.0), np.zeros(3)
         size[axis], middle[axis] = 10, 5
-        found = voxelize_triangles(trimesh.creation.box(size).triangles + middle, *GRID)
+        volume = voxelize_triangles(trimesh.creation.box(size).triangles + middle, *GRID)
         expected = np.moveaxis(np.zeros((8, 8, 8)) + (np.arange(8) >= 4)[:, None, None], 0, axis)
-        np.testing.assert_allclose(found, expected, atol=1e-6)
+        np.testing.assert_allclose(volume, expected, atol=1e-6)

@@ -61,9 +61,9 @@ def opened(browser, address, dark=False, offline=True, ready=True, first=''):
 
     first   a script that runs before those of the page
 
-    `page.said` are the errors and warnings so far, `page.asked` the addresses that it has asked for.
+    `page.messages` are the errors and warnings so far, `page.addresses` the addresses of its requests.
     """
-    said, asked = [], []
+    messages, asked = [], []
     scheme = 'dark' if dark else 'light'
     context = browser.new_context(offline=offline, viewport=dict(width=1280, height=900), color_scheme=scheme)
     try:
@@ -71,17 +71,17 @@ def opened(browser, address, dark=False, offline=True, ready=True, first=''):
         page.set_default_timeout(60_000)
         page.on(
             'console',
-            lambda m: m.type in ('error', 'warning') and not any(o in m.text for o in OURS) and said.append(m.text),
+            lambda m: m.type in ('error', 'warning') and not any(o in m.text for o in OURS) and messages.append(m.text),
         )
-        page.on('pageerror', lambda error: said.append(str(error)))
+        page.on('pageerror', lambda error: messages.append(str(error)))
         page.on('request', lambda request: asked.append(request.url))
         page.add_init_script(first)
         page.goto(address)
         if ready:
             page.wait_for_selector('html[data-ready]')
-        page.asked, page.said = asked, said
+        page.addresses, page.messages = asked, messages
         yield page
-        assert said == []
+        assert messages == []
     finally:
         context.close()
 

@@ -28,8 +28,8 @@ def direct(scene, extent=6.0):
     """The image by the projectors alone: no code of the integrator's or of an effect's."""
     view = view_of(scene.sensors()[0])
     total = dr.zeros(mi.Float, view.height * view.width)
-    for thing in find_objects(scene):
-        total += thing.line_integrals(view, RenderOptions(extent))
+    for obj in find_objects(scene):
+        total += obj.line_integrals(view, RenderOptions(extent))
     dr.eval(mi.TensorXf(total, shape=(view.height, view.width, 1)))
 
 

@@ -14,21 +14,21 @@ def adds_in_any_order() -> bool:
     return dr.backend_v(mi.Float) == dr.JitBackend.CUDA and not STAND_IN
 
 
-def assert_same(found, expected):
+def assert_same(actual, expected):
     """To the last bit, or up to rounding where sums are in any order."""
-    found, expected = np.asarray(found), np.asarray(expected)
+    actual, expected = np.asarray(actual), np.asarray(expected)
     if adds_in_any_order():
-        np.testing.assert_allclose(found, expected, rtol=1e-5, atol=2e-6 * np.abs(expected).max())
+        np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=2e-6 * np.abs(expected).max())
     else:
-        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(actual, expected)
 
 
-def assert_same_volume(found, expected):
+def assert_same_volume(actual, expected):
     """Of an iterative method, which amplifies rounding: to the last bit, or to a thousandth of its norm."""
     if adds_in_any_order():
-        assert np.linalg.norm(found - expected) < 1e-3 * np.linalg.norm(expected)
+        assert np.linalg.norm(actual - expected) < 1e-3 * np.linalg.norm(expected)
     else:
-        np.testing.assert_array_equal(found, expected)
+        np.testing.assert_array_equal(actual, expected)
 
 
 def fits_alike(otherwise: float) -> float:

@@ -26,17 +26,17 @@ def in_use(path):
 def install(monkeypatch):
     """For one test."""
 
-    def refusing(own, refused):
+    def refusing(original, refused):
         def call(*paths, **options):
             if refused(*paths):
                 raise PermissionError(errno.EACCES, 'Access is denied', str(paths[0]))
-            return own(*paths, **options)
+            return original(*paths, **options)
 
         return call
 
     for name in 'replace', 'rename':
-        own = getattr(os, name)
-        monkeypatch.setattr(os, name, refusing(own, lambda a, b: os.path.isdir(b) or in_use(a) or in_use(b)))
+        original = getattr(os, name)
+        monkeypatch.setattr(os, name, refusing(original, lambda a, b: os.path.isdir(b) or in_use(a) or in_use(b)))
     for name in 'unlink', 'remove':
         monkeypatch.setattr(
             os, name, refusing(getattr(os, name), lambda path: not os.path.islink(path) and in_use(path))

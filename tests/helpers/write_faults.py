@@ -57,26 +57,26 @@ class Faults:
         """From here on, in this process, for ever."""
         for name in ('replace', 'rename', 'mkdir', 'fsync', 'ftruncate', 'unlink', 'remove', 'rmdir', 'write', 'link'):
             setattr(os, name, self._wrapped(getattr(os, name), frees=name in ('unlink', 'remove', 'rmdir')))
-        own = os.open
+        system_open = os.open
 
         def open_(path, flags, mode=0o777, *, dir_fd=None):
             if flags & WRITES and self.within(path, dir_fd) and self.due(path):
                 self.fail(path)
-            return own(path, flags, mode, dir_fd=dir_fd)
+            return system_open(path, flags, mode, dir_fd=dir_fd)
 
         os.open = open_
         builtins.open = io.open = self._opening(io.open)
 
-    def _wrapped(self, own, frees):
+    def _wrapped(self, original, frees):
         def call(path, *arguments, **options):
             missing = frees and not os.path.lexists(path)  # nothing is written then
             if not missing and options.get('dir_fd') is None and self.due(path, frees):
                 self.fail(path)
-            return own(path, *arguments, **options)
+            return original(path, *arguments, **options)
 
         return call
 
-    def _opening(self, own):
+    def _opening(self, call):
         faults = self
 
         class File(io.FileIO):
@@ -89,7 +89,7 @@ class Faults:
 
         def open_(file, mode='r', buffering=-1, encoding=None, errors=None, newline=None, closefd=True, opener=None):
             if not {*mode} & {*'wxa+'} or not self.within(file):
-                return own(file, mode, buffering, encoding, errors, newline, closefd, opener)
+                return call(file, mode, buffering, encoding, errors, newline, closefd, opener)
             if self.due(file):
                 self.fail(file)
             raw = File(file, mode.replace('b', '').replace('t', ''), closefd, opener)

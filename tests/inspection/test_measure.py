@@ -54,8 +54,8 @@ def test_axis_offset_is_measured(foot):
     moved = lm.Scan(foot.geometry, np.roll(foot.projections, 3, 2))
     shift = only(moved, 'the axis is off: add').orbit.shift
     assert shift == pytest.approx(-3 * foot.geometry.dDetector[1], abs=0.1 * foot.geometry.dDetector[1])
-    mended = lm.Scan(replace(foot.geometry, offDetector=(0, shift)), moved.projections)
-    assert advised(mended) == []
+    corrected = lm.Scan(replace(foot.geometry, offDetector=(0, shift)), moved.projections)
+    assert advised(corrected) == []
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
@@ -82,8 +82,8 @@ def test_frames_sorted_by_name(mode, first):
     scan = scanned('chest', mode, views=60)
     order = np.array(sorted(range(first, first + 60), key=str)) - first
     noise = np.random.default_rng(0).normal(0, 0.002 * scan.projections.max(), scan.projections.shape)
-    found = only(lm.Scan(scan.geometry, (scan.projections + noise)[order]), 'sorted by their names as text')
-    np.testing.assert_array_equal(found.text_order, order)
+    actual = only(lm.Scan(scan.geometry, (scan.projections + noise)[order]), 'sorted by their names as text')
+    np.testing.assert_array_equal(actual.text_order, order)
 
 
 def test_views_of_any_other_order_are_not_sorted_by_name():
@@ -115,8 +115,8 @@ def test_sense_and_unit_of_angles(foot):
 
 
 def test_air_and_truncation(foot):
-    found = only(lm.Scan(foot.geometry, foot.projections + 3), 'instead of 0: import again with --air')
-    assert found.border.air == pytest.approx(3, abs=0.1)
+    actual = only(lm.Scan(foot.geometry, foot.projections + 3), 'instead of 0: import again with --air')
+    assert actual.border.air == pytest.approx(3, abs=0.1)
     cut = lm.Scan(replace(foot.geometry, nDetector=(110, 40)), foot.projections[:, :, 28:68])
     assert measure(cut).border.cut_sides > len(cut) / 2
     assert any('left or right edge' in line and '--method lingo also needs -D' in line for line in advised(cut))
@@ -139,10 +139,10 @@ def test_noisy_pixels_are_not_the_object(mode, level, kind):
     for part in (np.s_[:, :, 30:66], np.s_[:, 50:, :]):
         p = scan.projections[part]
         geometry = replace(scan.geometry, nDetector=p.shape[1:])
-        found, quiet = (measure(lm.Scan(geometry, q)).border for q in (noisy(p, level, kind), p))
+        actual, quiet = (measure(lm.Scan(geometry, q)).border for q in (noisy(p, level, kind), p))
         for name in ('cut_sides', 'cut_ends'):
             expected = getattr(quiet, name)
-            assert abs(getattr(found, name) - expected) <= 0.1 * len(scan), name
+            assert abs(getattr(actual, name) - expected) <= 0.1 * len(scan), name
         assert max(quiet.cut_sides, quiet.cut_ends) > 20
 
 
@@ -157,8 +157,8 @@ def test_an_object_at_a_corner_of_the_edge(foot):
 def test_pixels_that_are_not_valid_disagree_with_nothing(foot):
     valid = np.ones(foot.projections.shape, bool)
     valid[:, :, 30] = False
-    found, whole = measure(replace(foot, valid=valid)).orbit, measure(foot).orbit
-    assert found.disagreement < whole.disagreement + 0.005  # 0.056 where they count as air
+    actual, whole = measure(replace(foot, valid=valid)).orbit, measure(foot).orbit
+    assert actual.disagreement < whole.disagreement + 0.005  # 0.056 where they count as air
     valid[:, :, 31] = False
     assert measure(replace(foot, valid=valid)).orbit.obstacle == 'gaps'
 
@@ -174,9 +174,9 @@ def test_scans_of_nothing_and_of_few_pixels(foot):
 
 def test_the_wrong_sign_is_said_and_drawn(foot, tmp_path):
     scan = replace(foot, projections=-foot.projections)
-    found = measure(scan)
-    assert any('give -ln(I / I0)' in line for line in advice(scan, found))
-    draw(tmp_path / 'sheet.png', scan, found)
+    actual = measure(scan)
+    assert any('give -ln(I / I0)' in line for line in advice(scan, actual))
+    draw(tmp_path / 'sheet.png', scan, actual)
     assert (tmp_path / 'sheet.png').stat().st_size > 10_000
     assert not measure(foot).negative
 
@@ -207,8 +207,8 @@ def test_air_of_single_views(foot):
 def test_a_small_drift_of_air_names_calibrate(foot):
     """1 % of the highest line integral, up and down; nothing else is wrong."""
     p = foot.projections + np.linspace(-0.01, 0.01, len(foot))[:, None, None] * foot.projections.max()
-    found = only(lm.Scan(foot.geometry, p.astype(np.float32)), 'take it out with lingo-mi calibrate')
-    assert found.orbit.disagreement == pytest.approx(measure(foot).orbit.disagreement, abs=0.001)
+    actual = only(lm.Scan(foot.geometry, p.astype(np.float32)), 'take it out with lingo-mi calibrate')
+    assert actual.orbit.disagreement == pytest.approx(measure(foot).orbit.disagreement, abs=0.001)
 
 
 @pytest.mark.parametrize('level', [0.02, -0.02])
@@ -216,8 +216,8 @@ def test_a_drift_of_air_does_not_change_the_sense(level):
     scan = scanned('foot', views=60)
     p = scan.projections / scan.projections.max() + np.linspace(-level, level, 60)[:, None, None]
     for sense in (1, -1):
-        found = measure(lm.Scan(replace(scan.geometry, angles=sense * scan.geometry.angles), p))
-        assert (found.orbit.reversed is not None) == (sense < 0)
+        actual = measure(lm.Scan(replace(scan.geometry, angles=sense * scan.geometry.angles), p))
+        assert (actual.orbit.reversed is not None) == (sense < 0)
 
 
 @pytest.mark.parametrize('counts', [1.0, 4e4])
@@ -227,11 +227,11 @@ def test_intensities(foot, counts):
     light = light * np.exp(-foot.projections / foot.projections.max() * 2)
     light = light * (1 - 0.1 * np.linspace(-1, 1, PIXELS) ** 2) * counts
     for p in (light, -np.log(light / light.max())):
-        found = measure(lm.Scan(foot.geometry, p))
+        actual = measure(lm.Scan(foot.geometry, p))
         if p is light:
-            assert found.intensities == pytest.approx(counts, rel=0.2)  # the beam is a tenth darker at the edges
+            assert actual.intensities == pytest.approx(counts, rel=0.2)  # the beam is a tenth darker at the edges
         else:
-            assert found.intensities is None
+            assert actual.intensities is None
     only(lm.Scan(foot.geometry, light), 'write input: intensity and I0: ')
 
 
@@ -248,9 +248,9 @@ def test_what_is_no_intensity(foot):
 def test_fit_and_reconstruct_warn_of_intensities(foot):
     light = lm.Scan(foot.geometry, 4e4 * np.exp(-foot.projections / foot.projections.max() * 2))
     few = light.on(lm.Grid(16, 16.0)).subset(slice(0, None, 5))
-    with pytest.warns(UserWarning, match='I0: 4e') as said:
+    with pytest.warns(UserWarning, match='I0: 4e') as warned:
         lm.reconstruct(few, lm.FDK(), progress=False)
-    assert len(said) == 1
+    assert len(warned) == 1
     with pytest.warns(UserWarning, match='I0: 4e'):
         lm.fit(few, iterations=1, n_points=20, progress=False)
 

@@ -92,13 +92,13 @@ def test_otsu_of_a_flat_image_is_its_value(value):
 def test_masks():
     images = np.random.default_rng(0).random((3, 8, 9)).astype(np.float32)
     images *= np.array([1, 2, 0])[:, None, None]
-    found = masks(images, 0.1)
+    masked = masks(images, 0.1)
     for o, image in enumerate(images):
         t_high = otsu(image)
-        assert found.t_high[o] == t_high and found.t_low[o] == t_high * 0.1
-        np.testing.assert_array_equal(found.high[o], image > t_high)
-        np.testing.assert_array_equal(found.low[o], image > t_high * 0.1)
-    assert not found.low[2].any()
+        assert masked.t_high[o] == t_high and masked.t_low[o] == t_high * 0.1
+        np.testing.assert_array_equal(masked.high[o], image > t_high)
+        np.testing.assert_array_equal(masked.low[o], image > t_high * 0.1)
+    assert not masked.low[2].any()
 
 
 def test_otsu_of_an_image_that_is_constant_but_for_rounding():
@@ -157,17 +157,17 @@ def test_voxel_centres():
 def test_valid_voxels(monkeypatch, mode, misses, outside):
     geometry = scan(mode, dDetector=(0.1037, 0.0911), nVoxel=(9, 7, 6))  # panel too small
     frames, grid = geometry.normalised_rays(), geometry.grid.shape
-    found = random_masks(len(frames), geometry.nDetector, np.random.default_rng(4))
+    masked = random_masks(len(frames), geometry.nDetector, np.random.default_rng(4))
     expected = [
         literal_filter(frames, images, grid, geometry.grid.half, misses, outside == 'ignore')
-        for images in (found.low, found.high)
+        for images in (masked.low, masked.high)
     ]
     assert 0 < len(expected[0]) < np.prod(grid) and len(expected[1]) < len(expected[0])
     for blocks in (False, True):
         if blocks:  # the coarse rejection must change nothing
             monkeypatch.setattr(voxel_filter, 'CHUNK', 100)
             monkeypatch.setattr(voxel_filter, 'BLOCK', 3)
-        cells = valid_voxels(frames, found, grid, geometry.grid.half, misses, outside)
+        cells = valid_voxels(frames, masked, grid, geometry.grid.half, misses, outside)
         assert [c.tolist() for c in cells] == expected
 
 
@@ -182,20 +182,20 @@ def test_points_outside_the_image_are_removed_not_clamped():
 
 def test_valid_voxels_errors():
     geometry = scan()
-    found = random_masks(4, geometry.nDetector, np.random.default_rng(0))
+    masked = random_masks(4, geometry.nDetector, np.random.default_rng(0))
     with pytest.raises(InputError, match='one a view'):
-        valid_voxels(geometry.normalised_rays(), found, (4, 4, 4), geometry.grid.half)
+        valid_voxels(geometry.normalised_rays(), masked, (4, 4, 4), geometry.grid.half)
     with pytest.raises(InputError, match='outside'):
-        valid_voxels(geometry.normalised_rays()[:4], found, (4, 4, 4), geometry.grid.half, outside='clamp')
+        valid_voxels(geometry.normalised_rays()[:4], masked, (4, 4, 4), geometry.grid.half, outside='clamp')
 
 
 def test_occupancy_and_scaling():
     geometry = scan(nVoxel=(40, 40, 40), dVoxel=(0.05,) * 3, n=2)
     frames = geometry.normalised_rays()
-    found = random_masks(len(frames), geometry.nDetector, np.random.default_rng(4))
-    expected = len(literal_filter(frames, found.low, (16, 16, 16), geometry.grid.half)) / 16**3
+    masked = random_masks(len(frames), geometry.nDetector, np.random.default_rng(4))
+    expected = len(literal_filter(frames, masked.low, (16, 16, 16), geometry.grid.half)) / 16**3
     assert 0 < expected < 1
-    assert occupancy(frames, found, geometry.grid.half, geometry.grid.shape) == expected
+    assert occupancy(frames, masked, geometry.grid.half, geometry.grid.shape) == expected
     assert scale_factor(0.3) == 0.3 * 20 and scale_factor(0.01) == 1 and scale_factor(0.5, V_S=10) == 5
     assert scaled_grid((256, 256, 178), 2.5) == (102, 102, 71)
     assert scaled_grid((256, 256, 178), 1.0) == (256, 256, 178)

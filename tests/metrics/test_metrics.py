@@ -69,15 +69,17 @@ def test_ssim_map_against_the_written_out_sum(pair):
 
 def test_2d_measures_against_scikit_image(pair):
     a, b = pair
-    own = [(x / x.max(), y / y.max()) for x, y in zip(a, b)]
-    assert psnr_2d_r2(a, b) == pytest.approx(np.mean([peak_signal_noise_ratio(y, x, data_range=1.0) for x, y in own]))
+    scaled = [(x / x.max(), y / y.max()) for x, y in zip(a, b)]
+    assert psnr_2d_r2(a, b) == pytest.approx(
+        np.mean([peak_signal_noise_ratio(y, x, data_range=1.0) for x, y in scaled])
+    )
     assert psnr_2d(a, b) == pytest.approx(
         np.mean([peak_signal_noise_ratio(y, x, data_range=b.max()) for x, y in zip(a, b)])
     )
     assert psnr_2d(a, b, peak=7.0) == pytest.approx(
         np.mean([peak_signal_noise_ratio(y, x, data_range=7.0) for x, y in zip(a, b)])
     )
-    assert ssim_2d_r2(a, b) == pytest.approx(np.mean([ssim_map(x, y) for x, y in own]))
+    assert ssim_2d_r2(a, b) == pytest.approx(np.mean([ssim_map(x, y) for x, y in scaled]))
     assert ssim_2d(a, b) == pytest.approx(np.mean([ssim_map(x / b.max(), y / b.max()) for x, y in zip(a, b)]))
 
 
@@ -202,8 +204,8 @@ def test_views_on_threads_keep_their_order_and_few_are_taken_in_advance():
         time.sleep(0.02 * (i == 0))
         return i + j
 
-    for done, found in enumerate(metrics._each(slow_first, items(), metrics.SLAB)):
-        assert found == done + 100
+    for done, actual in enumerate(metrics._each(slow_first, items(), metrics.SLAB)):
+        assert actual == done + 100
         most = max(most, len(taken) - done)
     assert most <= 4 and len(taken) == 20  # three slabs at a time
     with pytest.raises(ZeroDivisionError):

@@ -122,8 +122,8 @@ def test_bad_input(name, size, seed, message):
 
 def test_modules_import_no_mitsuba():
     for path in Path(phantoms.__file__).parent.glob('*.py'):
-        found = re.search(r'^(import|from) +(mitsuba|drjit|\.\.xray)', path.read_text(), re.MULTILINE)
-        assert not found, path
+        import_line = re.search(r'^(import|from) +(mitsuba|drjit|\.\.xray)', path.read_text(), re.MULTILINE)
+        assert not import_line, path
 
 
 # ---- foot and chest ----------------------------------------------------------------------------------------
@@ -294,8 +294,8 @@ def test_script_refuses(args, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr('lingo_mi.cli.phantom.room', lambda: 16 * 2**30)
     monkeypatch.chdir(tmp_path)
     assert _run_here(monkeypatch, *args) == 2
-    said = capsys.readouterr().err
-    assert said.startswith('error: ') and said.count('\n') == 1
+    message = capsys.readouterr().err
+    assert message.startswith('error: ') and message.count('\n') == 1
     assert not list(tmp_path.iterdir())
 
 
@@ -306,7 +306,7 @@ def test_real_attenuation_is_that_of_bone(name):
     bone = 3 * 0.0206
     np.testing.assert_allclose(real.data, bone * plain.data, rtol=1e-6)
     assert real.data.max() <= bone
-    scans = [lm.simulate(thing, views=1, progress=False).train.projections for thing in (plain, real)]
+    scans = [lm.simulate(phantom, views=1, progress=False).train.projections for phantom in (plain, real)]
     np.testing.assert_allclose(scans[1], bone * scans[0], rtol=1e-5)
     with pytest.raises(InputError, match="attenuation must be 'x3d' or 'real'"):
         lm.phantom(name, size=16, attenuation='hu')

@@ -24,8 +24,8 @@ def test_a_cloud():
     geometry = load({}, CURVED).sensors()[0].geometry
     assert isinstance(geometry, CurvedGeometry)
     expected = project(cloud.centre, cloud.scale, cloud.rotation, cloud.density, geometry, extent=6.0)[0]
-    found = render(load(dict(cloud=ellipsoids(cloud)), CURVED))[..., 0]
-    np.testing.assert_allclose(found, expected, atol=1e-6 * expected.max())
+    image = render(load(dict(cloud=ellipsoids(cloud)), CURVED))[..., 0]
+    np.testing.assert_allclose(image, expected, atol=1e-6 * expected.max())
     assert np.abs(render(scene)[..., 0] - expected).max() > 0.01 * expected.max()  # of the flat panel
 
 
@@ -37,8 +37,8 @@ def test_rays_are_mitsubas_own():
     y, x = np.divmod(np.arange(rows * columns), columns)
     start, direction = sensor.geometry.rays(curved=True).through(0, x + 0.5, y + 0.5)
     direction = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    for found, expected in zip(mitsuba_rays(sensor), (start, direction)):
-        np.testing.assert_allclose(found, expected, atol=1e-6)
+    for actual, expected in zip(mitsuba_rays(sensor), (start, direction)):
+        np.testing.assert_allclose(actual, expected, atol=1e-6)
     params = mi.traverse(scene)
     params['sensor.film.crop_size'], params['sensor.film.crop_offset'] = [10, 8], [7, 4]
     params.update()
@@ -69,8 +69,8 @@ def test_a_grid():
 def test_a_turned_instance_is_a_turned_scanner():
     group = dict(type='shapegroup', **objects())
     moved = dict(type='instance', shapes=dict(type='ref', id='group'), to_world=transform().rotate([0, 0, 1], -20))
-    found = render(load(dict(group=group, moved=moved), CURVED))
-    np.testing.assert_allclose(found, render(load(objects(), dict(CURVED, angles='53'))), rtol=1e-5, atol=3e-6)
+    image = render(load(dict(group=group, moved=moved), CURVED))
+    np.testing.assert_allclose(image, render(load(objects(), dict(CURVED, angles='53'))), rtol=1e-5, atol=3e-6)
 
 
 def test_derivatives():
@@ -82,13 +82,13 @@ def test_derivatives():
     dr.enable_grad(params['cloud.density'])
     params.update()
     dr.backward(dr.sum(mi.render(scene, params) * mi.TensorXf(weight), axis=None))
-    found = dr.grad(params['cloud.density']).numpy()[2]
+    gradient = dr.grad(params['cloud.density']).numpy()[2]
     sums = []
     for step in (-0.1, 0.1):
         params['cloud.density'] = mi.Float(values + step * (np.arange(len(values)) == 2))
         params.update()
         sums.append((render(scene) * weight).sum())
-    assert found == pytest.approx((sums[1] - sums[0]) / 0.2, rel=1e-4)
+    assert gradient == pytest.approx((sums[1] - sums[0]) / 0.2, rel=1e-4)
 
 
 @pytest.mark.parametrize(

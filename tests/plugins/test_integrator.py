@@ -75,7 +75,7 @@ def test_ellipsoids(colour):
 
 def test_objects_add_up(colour):
     parts = everything()
-    total = sum(render(load({name: thing})) for name, thing in parts.items())
+    total = sum(render(load({name: shape})) for name, shape in parts.items())
     assert relative(render(load(parts)), total) < 1e-6
 
 
@@ -94,8 +94,8 @@ def test_constant_grid_is_a_block():
     with np.errstate(divide='ignore'):
         a, b = ((np.array([0.1, 0.2, 0.3]) + s * np.array([0.4, 0.5, 0.6]) - start) / direction for s in (-1, 1))
     chord = np.maximum(np.maximum(a, b).min(1) - np.minimum(a, b).max(1), 0) * np.linalg.norm(direction, axis=1)
-    for thing in (grid(np.full((5, 4, 6), 0.7), where), solid):
-        image = render(load(dict(thing=thing)))
+    for shape in (grid(np.full((5, 4, 6), 0.7), where), solid):
+        image = render(load(dict(box=shape)))
         np.testing.assert_allclose(image.ravel(), 0.7 * chord, rtol=1e-5, atol=3e-6)
 
 
@@ -215,13 +215,13 @@ def test_scene_gradients(colour):
         assert relative(dr.grad(params['cloud.density']).numpy(), expected['density']) < 1e-5
 
         # Integrals are linear in the grid's values, so a large step has no error but rounding.
-        found = np.array(dr.grad(params[keys[2]]), float)[..., 0].transpose(2, 1, 0)
-        norm = np.linalg.norm(found)
+        gradient = np.array(dr.grad(params[keys[2]]), float)[..., 0].transpose(2, 1, 0)
+        norm = np.linalg.norm(gradient)
         for index in [(0, 0, 0), (2, 3, 1), (4, 3, 5), (1, 2, 3)]:
             unit = np.zeros((5, 4, 6))
             unit[index] = 1
             change = render(load(dict(grid=grid(unit)))).ravel() @ slope
-            assert abs(found[index] - change) < 1e-5 * norm
+            assert abs(gradient[index] - change) < 1e-5 * norm
         if colour == 'mono':
             change = render(load(dict(block=block(1.0)))).ravel() @ slope
             assert abs(dr.grad(params[keys[3]]).numpy().item() / change - 1) < 1e-5
@@ -255,9 +255,9 @@ def test_forward_mode():
             dr.enable_grad(params[key])
             dr.set_grad(params[key], direction)
         params.update()
-        found = np.array(dr.forward_to(mi.render(scene, params)), float).ravel()
+        image = np.array(dr.forward_to(mi.render(scene, params)), float).ravel()
         expected = d_line if output == 'line_integral' else -np.exp(-render(load(objects)).ravel()) * d_line
-        assert relative(found, expected) < 1e-5
+        assert relative(image, expected) < 1e-5
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -519,17 +519,17 @@ def test_updates_of_another_number(name, count):
 
 
 def test_missing_density():
-    thing = ellipsoids(cloud_of())
-    del thing['density']
-    refused('\'cloud\' have no attribute "density"', dict(cloud=thing))
+    shape = ellipsoids(cloud_of())
+    del shape['density']
+    refused('\'cloud\' have no attribute "density"', dict(cloud=shape))
 
 
 def test_grid_outside_a_cube():
-    thing = grid(values_of())
-    refused('must fill an axis-aligned cube', dict(thing=dict(thing, type='sphere', to_world=transform())))
+    volume_grid = grid(values_of())
+    refused('must fill an axis-aligned cube', dict(box=dict(volume_grid, type='sphere', to_world=transform())))
     for turn in (transform().rotate([0, 0, 1], 30), transform().rotate([0, 0, 1], 90), transform().scale([1, -1, 1])):
-        refused('must fill an axis-aligned cube', dict(thing=grid(values_of(), turn)))
-    refused('must fill an axis-aligned cube', dict(thing=dict(thing, to_world=transform().scale(0.7))))
+        refused('must fill an axis-aligned cube', dict(box=grid(values_of(), turn)))
+    refused('must fill an axis-aligned cube', dict(box=dict(volume_grid, to_world=transform().scale(0.7))))
 
 
 def test_an_albedo_may_be_a_grid_of_its_own_place():
@@ -537,21 +537,21 @@ def test_an_albedo_may_be_a_grid_of_its_own_place():
     plain, scattering = grid(values), grid(values)
     albedo = grid(np.full((2, 2, 2), 0.5), where)['interior']['sigma_t']
     scattering['interior']['albedo'] = albedo
-    np.testing.assert_array_equal(*(render(load(dict(thing=thing))) for thing in (plain, scattering)))
+    np.testing.assert_array_equal(*(render(load(dict(box=volume_grid))) for volume_grid in (plain, scattering)))
     scattering['interior']['sigma_t'], scattering['interior']['albedo'] = albedo, plain['interior']['sigma_t']
-    refused('must fill an axis-aligned cube', dict(thing=scattering))
+    refused('must fill an axis-aligned cube', dict(box=scattering))
 
 
 @pytest.mark.parametrize('size', [0.01, 1.0, 100.0])
 def test_a_grid_turned_by_less_than_can_be_told(size):
     """Ten thousandth parts of its size are, a hundred thousandth part is not."""
     turned = [grid(values_of(), transform().scale(size).rotate([0, 0, 1], angle)) for angle in (5e-4, 0.05)]
-    render(load(dict(thing=turned[0])))
-    refused('must fill an axis-aligned cube', dict(thing=turned[1]))
+    render(load(dict(box=turned[0])))
+    refused('must fill an axis-aligned cube', dict(box=turned[1]))
 
 
 def test_homogeneous_sphere():
-    refused("'thing' has a homogeneous medium, but is not a mesh", dict(thing=dict(block(), type='sphere')))
+    refused("'box' has a homogeneous medium, but is not a mesh", dict(box=dict(block(), type='sphere')))
 
 
 def test_unknown_sensor():

@@ -50,9 +50,9 @@ def test_a_film_in_colour_has_the_image(pixel_format, variant):
     mi.set_variant(variant.rsplit('_', 1)[0] + '_rgb')
     try:
         scene = load(everything(), dict(camera(), film=dict(FILM, pixel_format=pixel_format)))
-        image, found = render(scene), np.array(scene.sensors()[0].film().bitmap())
-        np.testing.assert_allclose(found[..., :3], image[..., :3], rtol=1e-6)
-        assert pixel_format == 'rgb' or (found[..., 3] == 1).all()
+        image, actual = render(scene), np.array(scene.sensors()[0].film().bitmap())
+        np.testing.assert_allclose(actual[..., :3], image[..., :3], rtol=1e-6)
+        assert pixel_format == 'rgb' or (actual[..., 3] == 1).all()
     finally:
         mi.set_variant(variant)
 
@@ -101,8 +101,8 @@ def test_crop_window_of_a_detector():
 def test_turned_instance_is_a_turned_scanner(mode):
     """Of every kind of object: a turn by -20 degrees about the axis is an angle of 20 degrees more."""
     scanner = dict(SCANNER, mode=mode)
-    found = render(load(instance(transform().rotate([0, 0, 1], -20)), scanner))
-    np.testing.assert_allclose(found, render(load(everything(), dict(scanner, angles='53'))), rtol=1e-5, atol=3e-6)
+    image = render(load(instance(transform().rotate([0, 0, 1], -20)), scanner))
+    np.testing.assert_allclose(image, render(load(everything(), dict(scanner, angles='53'))), rtol=1e-5, atol=3e-6)
 
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
@@ -110,8 +110,8 @@ def test_sheared_instance_is_a_sheared_mesh(mode):
     where = transform().translate([0.1, -0.05, 0.2]).rotate([0, 1, 1], 30).scale([0.9, 1.2, -0.7])
     sheared = dict(block(), to_world=where @ block()['to_world'])
     scanner = dict(SCANNER, mode=mode)
-    found = render(load(instance(where, dict(block=block())), scanner))
-    np.testing.assert_allclose(found, render(load(dict(block=sheared), scanner)), rtol=1e-5, atol=3e-6)
+    image = render(load(instance(where, dict(block=block())), scanner))
+    np.testing.assert_allclose(image, render(load(dict(block=sheared), scanner)), rtol=1e-5, atol=3e-6)
 
 
 def test_instances_add_up():

@@ -102,11 +102,11 @@ def render(c, view):
 def test_values_are_those_of_the_equations(mode, opacity):
     g, c = geometry(mode), cloud(opacity=opacity)
     frames, (height, width) = g.normalised_rays(), g.nDetector
-    found = render(c, View.of(frames, 0, height, width))
+    image = render(c, View.of(frames, 0, height, width))
     truth = literal(c, frames, height, width)
     assert truth.max() > 0.3
     # A pixel on the brink of 1/255 may fall to either side.
-    error = np.abs(found - truth)
+    error = np.abs(image - truth)
     assert np.sort(error.ravel())[-3] < 2e-5 and error.max() < 1.1 / 255
 
 
@@ -120,7 +120,7 @@ def test_derivatives_are_those_of_differences(mode):
     dr.enable_grad(arrays)
     image = composite(flatten(*arrays, view), height, width)
     dr.backward(dr.sum(image * mi.Float(np.float32(weight.ravel()))))
-    found = {n: np.array(dr.grad(a)).T.reshape(c[n].shape) for n, a in zip(NAMES, arrays)}
+    gradient = {n: np.array(dr.grad(a)).T.reshape(c[n].shape) for n, a in zip(NAMES, arrays)}
     rng = np.random.default_rng(2)
     for name in NAMES:
         wrong = 0
@@ -131,7 +131,7 @@ def test_derivatives_are_those_of_differences(mode):
             change = (ends[1] - ends[0]) / (2 * h)
             change[np.abs(change) > 1e2] = 0
             slope = (change * weight).sum()
-            wrong += abs((found[name] * direction).sum() - slope) > 2e-3 * np.linalg.norm(found[name] * direction)
+            wrong += abs((gradient[name] * direction).sum() - slope) > 2e-3 * np.linalg.norm(gradient[name] * direction)
         assert wrong == 0, name
 
 

@@ -34,14 +34,14 @@ def test_the_projection_in_parts(mode):
     frames, shape = scanner(mode)
     assert isinstance(frames, Rays)
     cloud, view = random_cloud(np.random.default_rng(1), 12), View.of(frames, 0, *shape)
-    found = []
+    values = []
     for cuts in (Cuts(False), Cuts(True)):
         gaussians = on_device(cloud)
         dr.enable_grad(gaussians)
         footprints = project(gaussians, view, extent=4.0, cut=cuts)
         weights = [dr.cos(type(v)(dr.arange(mi.UInt32, 12) + k)) for k, v in enumerate(footprints.values)]
         cuts.pass_on(footprints.values, weights)
-        found.append([np.array(dr.grad(g), float) for g in gaussians])
-    for whole, parts in zip(*found):
+        values.append([np.array(dr.grad(g), float) for g in gaussians])
+    for whole, parts in zip(*values):
         assert np.abs(whole).max() > 0
         np.testing.assert_allclose(parts, whole, rtol=1e-5, atol=1e-6 * np.abs(whole).max())

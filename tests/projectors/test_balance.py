@@ -42,8 +42,8 @@ def differentiated(cloud, function):
     return values.numpy(), [np.array(dr.grad(x), float).T for x in gaussians], weights
 
 
-def check(found, expected, found_gradients, expected_gradients):
-    assert relative(found, expected) < 2e-6
+def check(actual, expected, found_gradients, expected_gradients):
+    assert relative(actual, expected) < 2e-6
     for name, value in zip(NAMES, found_gradients):
         assert relative(value, expected_gradients[name]) < 1e-5, name
 
@@ -76,13 +76,13 @@ def test_meshes(sharing):
     low, high = np.array([-0.7, -0.5, -0.4]), np.array([0.6, 0.8, 0.5])
     box = trimesh.creation.box(bounds=[low, high])
     paths = MeshPaths(box.vertices, box.faces, 'box', sharing)
-    found = paths.lengths(View.of(frames, 0, *shape)).numpy()
+    actual = paths.lengths(View.of(frames, 0, *shape)).numpy()
     start, direction = Pose.of(frames, 0, *shape).rays()
     a, b = (low - start) / direction, (high - start) / direction
     inside = np.minimum(a, b).max(1), np.maximum(a, b).min(1)
     chords = np.maximum(inside[1] - inside[0], 0) * np.linalg.norm(direction, axis=1)
     assert chords.max() > 1
-    np.testing.assert_allclose(found, chords, rtol=0, atol=2e-6)
+    np.testing.assert_allclose(actual, chords, rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize('test', [test_images, test_voxels, test_meshes])
@@ -106,8 +106,8 @@ def test_parts_of_a_sum_on_a_gpu(monkeypatch):
     monkeypatch.setattr(balance, 'gpu', lambda: SimpleNamespace(capability=80))
     monkeypatch.setattr(balance, 'resident_warps', lambda: 8)
     monkeypatch.setattr(depth, 'deep', lambda: 10)
-    found = line_integrals(*on_device(many), view, RenderOptions(6.0)).numpy()
-    assert relative(found, expected) < 1e-6
+    actual = line_integrals(*on_device(many), view, RenderOptions(6.0)).numpy()
+    assert relative(actual, expected) < 1e-6
 
 
 def test_as_many_shares_as_asked():
@@ -128,11 +128,11 @@ def test_packets_that_an_interval_covers(layout):
     size, step = layout.size, layout.step
     for i, (first, last) in enumerate(zip(np.ceil(low + offset) + column, np.floor(high + offset) + column)):
         within = [e for e in range(packets * size) if first <= e <= last] if i % 10 else []
-        found = range(begin.numpy()[i], end.numpy()[i])
+        covered = range(begin.numpy()[i], end.numpy()[i])
         if not within:
-            assert len(found) == 0
+            assert len(covered) == 0
         else:
-            assert found == range(within[0] // step * layout.columns, within[-1] // size + 1)
+            assert covered == range(within[0] // step * layout.columns, within[-1] // size + 1)
 
 
 @pytest.mark.parametrize('shares', [0.125, 1, 20])

@@ -37,10 +37,10 @@ def columns_of(geometry):
     return PosedGeometry(poses=poses, nDetector=(geometry.nDetector[0], 1), grid=geometry.grid)
 
 
-def same(found, geometry, columns):
+def same(actual, geometry, columns):
     (n_v, n_u), n = geometry.nDetector, len(geometry)
     expected = columns.reshape(n, n_u, n_v).transpose(0, 2, 1)
-    np.testing.assert_allclose(found, expected, atol=3e-5 * np.abs(expected).max())
+    np.testing.assert_allclose(actual, expected, atol=3e-5 * np.abs(expected).max())
 
 
 @pytest.fixture
@@ -70,12 +70,12 @@ def test_backprojections_agree(kind):
     geometry = GEOMETRIES['flying spot']
     A = kind(geometry)
     y = np.random.default_rng(1).random((3, *geometry.nDetector), np.float32)
-    found = A.adjoint(A.images(y), range(3)).numpy()
+    actual = A.adjoint(A.images(y), range(3)).numpy()
     ones = np.zeros(A.voxels, np.float32)
     for voxel in (0, 40, 346, 692):
         ones[voxel] = 1
         image = A.forward(mi.Float(ones), range(3))[0].numpy().reshape(3, 41, 17).transpose(0, 2, 1)
-        assert found[voxel] == pytest.approx(np.vdot(image, y), rel=1e-5)
+        assert actual[voxel] == pytest.approx(np.vdot(image, y), rel=1e-5)
         ones[voxel] = 0
 
 
@@ -106,6 +106,6 @@ def test_a_clinical_scanner():
         near = np.cross(o - centre, d / np.linalg.norm(d, axis=-1, keepdims=True))
         expected[view] = np.sqrt(2 * np.pi) * width * np.exp(-0.5 * (near**2).sum(-1) / width**2)
     assert isinstance(g, CurvedGeometry) and Projector(g)._kind is Joseph
-    for found in (project_volume(volume, g), Projector(g)(volume)):
-        assert np.linalg.norm(found - expected) / np.linalg.norm(expected) < 0.01  # of the voxels
+    for actual in (project_volume(volume, g), Projector(g)(volume)):
+        assert np.linalg.norm(actual - expected) / np.linalg.norm(expected) < 0.01  # of the voxels
     assert np.linalg.norm(project_volume(volume, flat) - expected) / np.linalg.norm(expected) > 0.1

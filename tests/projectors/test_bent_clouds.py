@@ -137,8 +137,8 @@ def test_tangents(scanner):
     dr.enable_grad(again)
     dr.backward(dr.sum(line_integrals(*again, view=view(scanner), options=OPTIONS) * mi.Float(weights)))
     products = [(host(dr.grad(a)).astype(float) * host(d)).ravel() for a, d in zip(again, directions)]
-    found, expected = tangent @ weights, np.concatenate(products).sum()
-    assert abs(found - expected) < 1e-5 * np.linalg.norm(tangent) * np.linalg.norm(weights)
+    actual, expected = tangent @ weights, np.concatenate(products).sum()
+    assert abs(actual - expected) < 1e-5 * np.linalg.norm(tangent) * np.linalg.norm(weights)
 
 
 def test_rigid_motions(scanner):
@@ -150,7 +150,7 @@ def test_rigid_motions(scanner):
     dr.enable_grad(pose)
     dr.backward(dr.sum(line_integrals(*on_device(cloud), view=seen, options=OPTIONS) * mi.Float(weights)))
     gradient = np.array([[float(c[0]) for c in dr.grad(p)] for p in pose])
-    found = rays.by_motion(gradient[None])[0]
+    actual = rays.by_motion(gradient[None])[0]
 
     def loss(motion):
         from scipy.spatial.transform import Rotation
@@ -159,7 +159,7 @@ def test_rigid_motions(scanner):
         return (weights * oracle.line_integrals(cloud, lines(scanner, moved))).sum()
 
     expected = [oracle.derivative(lambda by, axis=axis: loss(by * axis), 1e-4) for axis in np.eye(6)]
-    assert relative(found, expected) < 1e-4
+    assert relative(actual, expected) < 1e-4
 
 
 def test_functions_of_arrays():

@@ -9,7 +9,7 @@ from lingo_mi.projectors.depth import deep, deepest, parts_of
 SHAPES = {2: (300, 70), 3: (40, 20, 30)}
 
 
-def found(places, shape, covered=1.0):
+def depth_of(places, shape, covered=1.0):
     axes = [mi.Int32(np.asarray(p, np.int32)) for p in places]
     return float(deepest(axes, mi.Float(np.full(len(places[0]), covered, np.float32)), shape)[0])
 
@@ -20,13 +20,13 @@ def test_a_pile_in_one_element(shape):
     rng, count = np.random.default_rng(0), 2 * deep()
     around = [rng.integers(0, n, 500) for n in shape]
     pile = [np.full(count, n // 3) for n in shape]
-    assert found([np.append(a, b) for a, b in zip(around, pile)], shape) == pytest.approx(count, abs=5)
+    assert depth_of([np.append(a, b) for a, b in zip(around, pile)], shape) == pytest.approx(count, abs=5)
 
 
 @pytest.mark.parametrize('shape', SHAPES.values(), ids=SHAPES)
 def test_items_in_elements_of_their_own(shape):
     places = np.unravel_index(np.arange(3 * deep()), shape)
-    assert found(places, shape) < 0.02 * deep()
+    assert depth_of(places, shape) < 0.02 * deep()
 
 
 @pytest.mark.parametrize('shape', SHAPES.values(), ids=SHAPES)
@@ -34,7 +34,7 @@ def test_items_that_cover_everything(shape):
     """They overlap with their centres anywhere; different numbers are added, which counts RANDOM times less."""
     rng, count = np.random.default_rng(0), 4 * deep()
     places = [rng.integers(0, n, count) for n in shape]
-    depth = found(places, shape, float(np.prod(shape)))
+    depth = depth_of(places, shape, float(np.prod(shape)))
     assert depth == pytest.approx(count / 32, rel=0.02)
 
 
@@ -43,12 +43,12 @@ def test_large_clouds_are_sampled():
     rng, count = np.random.default_rng(0), 100_000
     at = np.where(np.arange(count) % 10 == 0, 5, rng.integers(0, 70, count)), rng.integers(0, 300, count)
     at[1][::10] = 7
-    assert found(at[::-1], (300, 70)) == pytest.approx(count / 10, rel=0.1)
+    assert depth_of(at[::-1], (300, 70)) == pytest.approx(count / 10, rel=0.1)
 
 
 def test_few_items_need_no_count():
-    assert found([np.zeros(deep())] * 2, SHAPES[2]) == 0
-    assert found([np.zeros(deep() + 1)] * 2, SHAPES[2]) == deep() + 1
+    assert depth_of([np.zeros(deep())] * 2, SHAPES[2]) == 0
+    assert depth_of([np.zeros(deep() + 1)] * 2, SHAPES[2]) == deep() + 1
 
 
 def test_items_that_are_not_finite_are_not_counted():

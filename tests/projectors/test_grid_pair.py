@@ -52,17 +52,17 @@ def test_a_matrix_and_its_transpose(mode, masked):
     def images(projections):
         return projections.transpose(0, 2, 1).ravel()
 
-    found, paths = A.forward(mi.Float(np.float32(x).ravel()), chosen)
+    actual, paths = A.forward(mi.Float(np.float32(x).ravel()), chosen)
     expected, boxes = ((project_volume(v, geo) * valid)[chosen] for v in (x, np.ones_like(x)))
-    np.testing.assert_allclose(found.numpy(), images(expected), atol=2e-6 * expected.max())
+    np.testing.assert_allclose(actual.numpy(), images(expected), atol=2e-6 * expected.max())
     np.testing.assert_allclose(paths.numpy(), images(boxes), atol=2e-6 * boxes.max())
     anything = y if not masked else np.where(valid[chosen], y, 7.0)  # what stands in pixels left out counts for nothing
-    found = A.adjoint(A.images(anything), chosen)
+    actual = A.adjoint(A.images(anything), chosen)
     expected = backproject(y, geo.subset(chosen))
-    np.testing.assert_allclose(found.numpy(), expected.ravel(), atol=2e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(actual.numpy(), expected.ravel(), atol=2e-6 * np.abs(expected).max())
     voxel, total, ones = A.adjoint(A.images(anything), chosen, lambda *values: values)
     np.testing.assert_array_equal(voxel.numpy(), np.arange(x.size))
-    np.testing.assert_allclose(total.numpy(), found.numpy(), atol=2e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(total.numpy(), actual.numpy(), atol=2e-6 * np.abs(expected).max())
     expected = backproject(valid[chosen].astype(float), geo.subset(chosen))
     np.testing.assert_allclose(ones.numpy(), expected.ravel(), atol=2e-6 * expected.max())
     product = np.vdot(A.forward(mi.Float(np.float32(x).ravel()), chosen)[0].numpy().astype(float), images(y))

@@ -48,9 +48,9 @@ def image_and_gradients(gaussians, rays, wanted, frozen, weight=None, primal=Tru
         image = line_integrals(*inputs[:4], rays, RenderOptions(**{'extent': 4.0, **options}), primal)
         weights = mi.Float(np.random.default_rng(1).normal(size=dr.width(image)).astype(np.float32))
         dr.backward(image * (weights if weight is None else weight))
-        found = [dr.detach(image), *(dr.grad(x) for x in leaves)]
-        dr.eval(found)
-        return found
+        gradient = [dr.detach(image), *(dr.grad(x) for x in leaves)]
+        dr.eval(gradient)
+        return gradient
 
 
 CLOUD, ALL = (0, 1, 2, 3), tuple(range(8))
@@ -89,9 +89,9 @@ def traced():
 @pytest.mark.parametrize('again', (False, True), ids=('recorded', 'replayed'))
 def test_equal_to_traced_calls(traced, again):
     for name, call in calls().items():
-        for found, expected in zip(image_and_gradients(*call[:3], True, **call[3]), traced[name], strict=True):
-            assert_same(found, expected)
-            assert np.abs(np.array(found)).max() > 0, name
+        for actual, expected in zip(image_and_gradients(*call[:3], True, **call[3]), traced[name], strict=True):
+            assert_same(actual, expected)
+            assert np.abs(np.array(actual)).max() > 0, name
 
 
 def test_compiles_nothing_anew():
@@ -109,7 +109,7 @@ def test_compiles_nothing_anew():
 def test_from_rows():
     """As `lingo_xray` calls it: to the last bit what the columns give."""
     rows = uploaded(np.concatenate([np.array(x) for x in cloud(200)[:3]]).T.ravel())
-    upstream, found = uploaded(np.random.default_rng(2).normal(size=SIDE**2)), []
+    upstream, actual = uploaded(np.random.default_rng(2).normal(size=SIDE**2)), []
     for by_rows in (False, True, True):
         dr.disable_grad(rows)
         dr.enable_grad(rows)
@@ -119,11 +119,11 @@ def test_from_rows():
         else:
             image = line_integrals(*columns(rows), density, view(), options)
         dr.backward(image * upstream)
-        found.append((image.numpy(), dr.grad(rows).numpy()))
-    for other in found[1:]:
-        for a, b in zip(found[0], other, strict=True):
+        actual.append((image.numpy(), dr.grad(rows).numpy()))
+    for other in actual[1:]:
+        for a, b in zip(actual[0], other, strict=True):
             assert_same(a, b)
-    assert all(np.abs(x).max() > 0 for x in found[0])
+    assert all(np.abs(x).max() > 0 for x in actual[0])
 
 
 def test_derivatives_alone():

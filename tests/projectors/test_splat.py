@@ -91,10 +91,10 @@ def check(cloud, frames, shape, pose_too=True):
     if not pose_too:
         return
     for name, value in oracle.pose_gradients(cloud, pose, weights).items():
-        found = pose_grads[name]
+        pose_grad = pose_grads[name]
         if pose.parallel and name == 'source':  # a unit vector can only turn
-            found, value = (x - x @ pose.source * pose.source for x in (found, value))
-        assert relative(found, value) < 1e-5, name
+            pose_grad, value = (x - x @ pose.source * pose.source for x in (pose_grad, value))
+        assert relative(pose_grad, value) < 1e-5, name
 
 
 @pytest.mark.parametrize('name', VIEWS)
@@ -331,11 +331,11 @@ def test_powers_of_two(variant):
     x = np.concatenate([np.linspace(-125.9, 0, 100_001), -np.logspace(-40, 0, 1000), np.arange(-125, 1)]).astype(
         np.float32
     )
-    found = exp2_of_negative(mi.Float(x)).numpy()
+    actual = exp2_of_negative(mi.Float(x)).numpy()
     cuda = variant.startswith('cuda')
-    np.testing.assert_allclose(found, np.exp2(x.astype(float)), rtol=(3 if cuda else 1) * 1.2e-7)
+    np.testing.assert_allclose(actual, np.exp2(x.astype(float)), rtol=(3 if cuda else 1) * 1.2e-7)
     if not cuda:
-        np.testing.assert_array_equal(found[-126:], np.exp2(x[-126:].astype(float)))
+        np.testing.assert_array_equal(actual[-126:], np.exp2(x[-126:].astype(float)))
     assert np.all(exp2_of_negative(mi.Float([-126, -127, -200, -1e30, -np.inf])).numpy() <= 2.0**-126)
 
 
@@ -389,8 +389,8 @@ def test_gaussians_at_the_source_are_announced_where_options_cannot_hold(options
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter('always')
         dr.eval(line_integrals(*gaussians, View.of(frames, 0, *shape), RenderOptions(EXTENT, **options)))
-    said = [str(w.message) for w in caught if w.category is AccuracyWarning]
-    assert len(said) == (near and bool(options)) and all(text.startswith('1 Gaussians reach') for text in said)
+    messages = [str(w.message) for w in caught if w.category is AccuracyWarning]
+    assert len(messages) == (near and bool(options)) and all(text.startswith('1 Gaussians reach') for text in messages)
 
 
 def test_needles_along_the_ray_that_cannot_be_widened_are_announced():
@@ -400,8 +400,8 @@ def test_needles_along_the_ray_that_cannot_be_widened_are_announced():
     gaussians = mi.Point3f(0), mi.Vector3f(0.02, 0.02, 100), mi.Vector4f(*turn.tolist()), mi.Float(1)
     expected = line_integrals(*gaussians, view, RenderOptions(5.0)).numpy()
     with pytest.warns(AccuracyWarning, match='1 Gaussians reach'):
-        found = line_integrals(*gaussians, view, RenderOptions(5.0, area=True)).numpy()
-    assert expected.max() > 1 and relative(found, expected) < 1e-4
+        actual = line_integrals(*gaussians, view, RenderOptions(5.0, area=True)).numpy()
+    assert expected.max() > 1 and relative(actual, expected) < 1e-4
 
 
 def scanner_of(DSO, DSD, n, step):
@@ -419,9 +419,9 @@ def test_pixels_that_a_footprint_covers(mode):
     """A round one covers pi / 4 of its box."""
     frames, shape = scanner(mode, shape=(90, 90))
     gaussians = mi.Point3f(0), mi.Vector3f(0.1), mi.Vector4f(0, 0, 0, 1), mi.Float(1)
-    found = project(gaussians, View.of(frames, 0, *shape), 3.0)
-    rows, columns = found.row_end[0] - found.row_begin[0], found.width[0]
-    assert rows > 15 and found.area[0] == pytest.approx(np.pi / 4 * rows * columns, rel=0.2)
+    image = project(gaussians, View.of(frames, 0, *shape), 3.0)
+    rows, columns = image.row_end[0] - image.row_begin[0], image.width[0]
+    assert rows > 15 and image.area[0] == pytest.approx(np.pi / 4 * rows * columns, rel=0.2)
 
 
 def test_footprints_are_not_widened_unasked():

@@ -55,8 +55,8 @@ def test_before_an_upright_panel_it_is_the_other():
     """No ray of these is steeper than its fan."""
     geometry = scan(n=3, nVoxel=(16, 16, 8), dVoxel=2.0)
     x = mi.Float(np.random.default_rng(0).random(16 * 16 * 8, dtype=np.float32))
-    expected, found = (kind(geometry).forward(x, range(3))[0].numpy() for kind in (Joseph, TiltedJoseph))
-    np.testing.assert_allclose(found, expected, atol=1e-5 * expected.max())
+    expected, actual = (kind(geometry).forward(x, range(3))[0].numpy() for kind in (Joseph, TiltedJoseph))
+    np.testing.assert_allclose(actual, expected, atol=1e-5 * expected.max())
 
 
 def test_slabs_add_up():

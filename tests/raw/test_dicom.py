@@ -64,8 +64,8 @@ def test_a_helical_ct_pd_scan_is_reconstructed(tmp_path, monkeypatch):
     seen = scan.geometry.grid
     assert seen.low[2] < -170 and seen.high[2] > -130 and abs(seen.centre[2] + 150) < 3
     grid = Grid((32, 32, 24), 2.5, (0.0, 0.0, -150.0))
-    found = lm.reconstruct(lm.Scan(scan.geometry.on(grid), scan.projections), lm.CGLS(niter=15), progress=False)
-    volume = np.asarray(found.volume)
+    result = lm.reconstruct(lm.Scan(scan.geometry.on(grid), scan.projections), lm.CGLS(niter=15), progress=False)
+    volume = np.asarray(result.volume)
     axes = [low + 2.5 * (np.arange(n) + 0.5) for low, n in zip(grid.low, grid.shape)]
     points = np.stack(np.meshgrid(*axes, indexing='ij'), -1)
     for *centre, radius, density in SPHERES:
@@ -88,9 +88,9 @@ def test_a_ct_pd_scan_that_lacks_an_attribute(tmp_path, tag, message):
     scanner.write(tmp_path / 'scan', scanner.projections(SPHERES), without=[tag])
     with pytest.raises(lm.InputError, match=message):
         load(tmp_path / 'scan')
-    given = tmp_path / 'scan.yml'
-    given.write_text('DSO: 595\nDSD: 1085.6\ndDetector: 4\nradius: 1085.6\nangles: [0, 1, 2]\n')
-    assert len(load(tmp_path / 'scan', given)) == 3
+    path = tmp_path / 'scan.yml'
+    path.write_text('DSO: 595\nDSD: 1085.6\ndDetector: 4\nradius: 1085.6\nangles: [0, 1, 2]\n')
+    assert len(load(tmp_path / 'scan', path)) == 3
 
 
 def test_a_ct_pd_scan_needs_no_flats(tmp_path):

@@ -106,9 +106,9 @@ def test_pictures(tmp_path, suffix, dtype):
     stack = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, (11, 12, 9)).astype(dtype)
     for i, image in enumerate(stack):
         Image.fromarray(image).save(tmp_path / f'a{i}.{suffix}')
-    found = open_recording(tmp_path).views
-    assert (len(found), found.shape, found.dtype) == (11, (12, 9), dtype)
-    np.testing.assert_array_equal([found[i] for i in range(11)], stack)
+    views = open_recording(tmp_path).views
+    assert (len(views), views.shape, views.dtype) == (11, (12, 9), dtype)
+    np.testing.assert_array_equal([views[i] for i in range(11)], stack)
     (tmp_path / f'a3.{suffix}').write_bytes((tmp_path / f'a3.{suffix}').read_bytes()[:-40])
     with pytest.raises(InputError, match='a3'):
         open_recording(tmp_path).views[3]
@@ -140,9 +140,9 @@ def test_frames_that_rtk_reads(tmp_path):
     frames = np.random.default_rng(0).integers(0, 60_000, (11, 8, 8))
     for i, image in enumerate(frames):
         write_his(tmp_path / f'{i}.his', image)
-    found = open_recording(tmp_path).views
-    assert (len(found), found.shape, found.dtype) == (11, (8, 8), np.uint16)
-    np.testing.assert_array_equal([found[i] for i in range(11)], frames)
+    views = open_recording(tmp_path).views
+    assert (len(views), views.shape, views.dtype) == (11, (8, 8), np.uint16)
+    np.testing.assert_array_equal([views[i] for i in range(11)], frames)
     (tmp_path / '3.his').write_bytes((tmp_path / '3.his').read_bytes()[:90])
     with pytest.raises(InputError, match='3.his|frame 3'):
         open_recording(tmp_path).views[3]
@@ -216,9 +216,9 @@ def test_exposure_of_every_view(tmp_path, scan_yml):
 
 
 def test_crop_binning_and_views_keep_the_rays(tmp_path, raw, scan_yml):
-    given = save(tmp_path, raw)
-    whole = load(tmp_path / 'views.npy', scan_yml, **given)
-    part = load(tmp_path / 'views.npy', scan_yml, crop=(4, 20, 6, 36), binning=2, views=(1, None, 2), **given)
+    files = save(tmp_path, raw)
+    whole = load(tmp_path / 'views.npy', scan_yml, **files)
+    part = load(tmp_path / 'views.npy', scan_yml, crop=(4, 20, 6, 36), binning=2, views=(1, None, 2), **files)
     assert part.projections.shape == (3, 8, 15)
     rays, inner = whole.geometry.rays(), part.geometry.rays()
     np.testing.assert_allclose(inner.corner, (rays.corner + 4 * rays.v + 6 * rays.u)[1::2], atol=1e-9)
@@ -260,13 +260,13 @@ def test_without_flats_the_air_level_is_needed(tmp_path, raw, scan_yml):
     ],
 )
 def test_refused_in_one_line(tmp_path, raw, scan_yml, change, message):
-    given = save(tmp_path, raw)
+    files = save(tmp_path, raw)
     np.save(tmp_path / 'small.npy', raw.flats[:, :5])
     np.save(tmp_path / 'shut.npy', np.concatenate([raw.flats[:4], raw.darks[:1] + 5, raw.flats[4:]]))
     (tmp_path / 'commas.txt').write_text('0,25\n60,25\n120,25\n180,25\n240,25\n300,25\n')
     change = {name: tmp_path / value if isinstance(value, str) else value for name, value in change.items()}
     with pytest.raises(lm.InputError, match=message) as caught:
-        load(tmp_path / 'views.npy', scan_yml, **{**given, **change})
+        load(tmp_path / 'views.npy', scan_yml, **{**files, **change})
     assert '\n' not in str(caught.value) and len(str(caught.value)) < 300 + len(str(tmp_path))
 
 
@@ -287,23 +287,23 @@ def test_damaged_frame(tmp_path, raw, scan_yml):
 def test_black_view_and_counts_above_the_flat_are_warned_of(tmp_path, scan_yml):
     raw = raw_frames()
     raw.views[2] = 0
-    given = save(tmp_path, raw)
+    files = save(tmp_path, raw)
     with pytest.warns(UserWarning, match='view 2 is without counts'):
-        scan = load(tmp_path / 'views.npy', scan_yml, **given)
+        scan = load(tmp_path / 'views.npy', scan_yml, **files)
     assert not scan.valid[2].any() and scan.valid[3].any()
     raw = raw_frames(exposure=1.5)
-    given = save(tmp_path, raw)
+    files = save(tmp_path, raw)
     with pytest.warns(UserWarning, match='6 views .* more than 10 % brighter than the air level'):
-        load(tmp_path / 'views.npy', scan_yml, **given)
+        load(tmp_path / 'views.npy', scan_yml, **files)
 
 
 def test_import_writes_a_scan_with_its_history(tmp_path, raw, scan_yml, monkeypatch, capsys):
     from lingo_mi.cli import main
 
-    given = save(tmp_path, raw)
+    files = save(tmp_path, raw)
     out = tmp_path / 'out.npy'
     args = ['lingo-mi', 'import', tmp_path / 'views.npy', '--geometry', scan_yml, '--out', out]
-    args += ['--flats', given['flats'], '--darks', given['darks'], '--views', '::2']
+    args += ['--flats', files['flats'], '--darks', files['darks'], '--views', '::2']
 
     def run():
         monkeypatch.setattr('sys.argv', [str(a) for a in args])
@@ -408,8 +408,8 @@ def test_the_own_grid_lies_where_the_panel_sees(tmp_path, raw, crop):
     """As high as the rows that are kept, and around the axis as wide as the farthest column."""
     values = dict(DSO=100, DSD=150, dDetector=[1, 1], angles=list(range(0, 360, 60)))
     (tmp_path / 'scan.yml').write_text(yaml.safe_dump(values))
-    given = save(tmp_path, raw)
-    scan = load(tmp_path / 'views.npy', tmp_path / 'scan.yml', crop=crop, **given).geometry
+    files = save(tmp_path, raw)
+    scan = load(tmp_path / 'views.npy', tmp_path / 'scan.yml', crop=crop, **files).geometry
     v0, v1, u0, u1 = crop
     assert scan.grid.spacing == pytest.approx([2 / 3] * 3) and scan.grid.shape[2] == v1 - v0
     assert scan.grid.centre == pytest.approx([0, 0, (12 - (v0 + v1) / 2) * 2 / 3])
@@ -419,12 +419,12 @@ def test_the_own_grid_lies_where_the_panel_sees(tmp_path, raw, crop):
 def test_pixels_that_saturate_in_the_flats_are_left_out(tmp_path, raw):
     flats = np.minimum(raw.flats, 65535).astype(np.uint16)
     flats[:, 5:8, 6:9] = 65535
-    given = save(tmp_path, raw) | dict(flats=tmp_path / 'clipped.npy')
+    files = save(tmp_path, raw) | dict(flats=tmp_path / 'clipped.npy')
     np.save(tmp_path / 'clipped.npy', flats)
     np.save(tmp_path / 'views.npy', np.clip(raw.views, 0, 40000).astype(np.uint16))
     values = dict(DSO=100, DSD=150, dDetector=[1, 1], angles=list(range(0, 360, 60)))
     (tmp_path / 'scan.yml').write_text(yaml.safe_dump(values))
-    scan = load(tmp_path / 'views.npy', tmp_path / 'scan.yml', **given)
+    scan = load(tmp_path / 'views.npy', tmp_path / 'scan.yml', **files)
     assert not scan.valid[:, 5:8, 6:9].any() and scan.valid.mean() > 0.9
 
 
@@ -440,9 +440,9 @@ def test_a_stack_of_one_page(tmp_path):
 @pytest.mark.parametrize('name, value', [('valid', 'mask.npy'), ('I0', 5e4), ('input', 'intensity')])
 def test_a_geometry_of_finished_projections_is_refused(tmp_path, raw, scan_yml, name, value):
     scan_yml.write_text(scan_yml.read_text() + yaml.safe_dump({name: value}))
-    given = save(tmp_path, raw)
+    files = save(tmp_path, raw)
     with pytest.raises(lm.InputError, match=f'{name} describes projections, not raw frames'):
-        load(tmp_path / 'views.npy', scan_yml, **given)
+        load(tmp_path / 'views.npy', scan_yml, **files)
 
 
 @pytest.mark.parametrize(
@@ -460,9 +460,9 @@ def test_a_geometry_of_finished_projections_is_refused(tmp_path, raw, scan_yml, 
     ids=str,
 )
 def test_options_of_another_kind(tmp_path, raw, scan_yml, option):
-    given = save(tmp_path, raw)
+    files = save(tmp_path, raw)
     with pytest.raises(lm.InputError, match=next(iter(option))):
-        load(tmp_path / 'views.npy', scan_yml, **given | option)
+        load(tmp_path / 'views.npy', scan_yml, **files | option)
 
 
 def test_units_in_an_array_and_alignment_frames(tmp_path):
@@ -541,39 +541,39 @@ def test_a_closed_shutter(tmp_path, scan_yml):
     """Half of the noise of a dark frame is above the mean dark count, and looks like line integrals of 8."""
     raw = raw_frames()
     raw.views[2] = raw.darks[0]
-    given = save(tmp_path, raw)
+    files = save(tmp_path, raw)
     with pytest.warns(UserWarning, match='view 2 is without counts, or with hardly any'):
-        scan = load(tmp_path / 'views.npy', scan_yml, **given)
+        scan = load(tmp_path / 'views.npy', scan_yml, **files)
     assert not scan.valid[2].any() and scan.valid[[0, 1, 3, 4, 5]].mean() > 0.9
 
 
 def test_a_converter_of_fewer_bits_that_saturates(tmp_path, raw, scan_yml):
-    given = save(tmp_path, raw)
+    files = save(tmp_path, raw)
     np.save(tmp_path / 'views.npy', np.minimum(raw.views, 16383))
     with pytest.warns(UserWarning, match='6 views .* saturated: .* highest count of 16383; give saturation=16383'):
-        load(tmp_path / 'views.npy', scan_yml, **given)
+        load(tmp_path / 'views.npy', scan_yml, **files)
     flats = np.minimum(raw.flats, 16000)  # below
     np.save(tmp_path / 'flats.npy', flats)
     with pytest.warns(UserWarning, match='of the pixels are left out') as caught:
-        scan = load(tmp_path / 'views.npy', scan_yml, **given, saturation=16383)
+        scan = load(tmp_path / 'views.npy', scan_yml, **files, saturation=16383)
     assert len(caught) == 1 and 0.2 < scan.valid.mean() < 0.5
 
 
 def test_views_and_flats_of_different_types(tmp_path, raw, scan_yml):
     """Counts of flats may be higher than the type of the views can hold."""
-    given = save(tmp_path, raw)
+    files = save(tmp_path, raw)
     np.save(tmp_path / 'views.npy', np.minimum(raw.views // 2, 32766).astype(np.int16))
     np.save(tmp_path / 'flats.npy', np.minimum(raw.flats.astype(np.uint32) * 2, 65534).astype(np.uint16))
-    del given['darks']
+    del files['darks']
     assert (np.load(tmp_path / 'flats.npy') > 32767).mean() > 0.5
-    scan = load(tmp_path / 'views.npy', scan_yml, **given)
+    scan = load(tmp_path / 'views.npy', scan_yml, **files)
     assert scan.valid is None or scan.valid.mean() > 0.9
 
 
 def test_most_pixels_left_out(tmp_path, raw, scan_yml):
-    given = save(tmp_path, raw)
+    files = save(tmp_path, raw)
     with pytest.warns(UserWarning, match=r'[5-9]\d\.\d\d% of the pixels are left out'):
-        load(tmp_path / 'views.npy', scan_yml, **given, saturation=float(np.percentile(raw.flats[0], 30)))
+        load(tmp_path / 'views.npy', scan_yml, **files, saturation=float(np.percentile(raw.flats[0], 30)))
 
 
 @pytest.mark.parametrize('several', [False, True])

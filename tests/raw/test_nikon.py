@@ -107,9 +107,9 @@ def test_angles(tmp_path):
 
 @pytest.mark.skipif('LINGO_MI_DATA' not in os.environ, reason='needs LINGO_MI_DATA')
 def test_a_scanners_own_file():
-    found = read_xtekct(Path(os.environ['LINGO_MI_DATA']) / 'nikon' / 'radiogram.xtekct')
-    values = found.scanner
-    assert found.white == 60000 and len(values['angles']) == 3142 and values['nDetector'] == [2000, 1500]
+    recording = read_xtekct(Path(os.environ['LINGO_MI_DATA']) / 'nikon' / 'radiogram.xtekct')
+    values = recording.scanner
+    assert recording.white == 60000 and len(values['angles']) == 3142 and values['nDetector'] == [2000, 1500]
     assert values['angles'][-1] - values['angles'][0] == pytest.approx(360, abs=0.2)
 
 

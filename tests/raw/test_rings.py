@@ -120,5 +120,5 @@ def test_zingers_are_left_out_and_a_crack_is_not(tmp_path):
     crack = np.full((40, 40), 1000.0)
     crack[:, 20] = 3000.0
     crack[10, 10] = 3000.0
-    found = bright_outliers(crack, np.full(crack.shape, 1e4), np.ones(crack.shape, bool))
-    assert np.argwhere(found).tolist() == [[10, 10]]
+    actual = bright_outliers(crack, np.full(crack.shape, 1e4), np.ones(crack.shape, bool))
+    assert np.argwhere(actual).tolist() == [[10, 10]]

@@ -58,11 +58,11 @@ def test_more_than_a_hundred_frames_and_several_references(tmp_path):
     write_ole2(tmp_path / 'a.txrm', content(raw, MultiReferenceData__DataType=np.uint32(10), **flats, **none))
     from lingo_mi.raw.frames import open_recording
 
-    found = open_recording(tmp_path / 'a.txrm')
-    assert (len(found.views), len(found.flats)) == (203, 3)
+    recording = open_recording(tmp_path / 'a.txrm')
+    assert (len(recording.views), len(recording.flats)) == (203, 3)
     for i in (0, 99, 100, 202):
-        np.testing.assert_array_equal(found.views[i], raw.views[i])
-    np.testing.assert_array_equal(found.flats[2], raw.flats[2])
+        np.testing.assert_array_equal(recording.views[i], raw.views[i])
+    np.testing.assert_array_equal(recording.flats[2], raw.flats[2])
 
 
 def test_shifts_move_the_panel(tmp_path):

@@ -42,32 +42,32 @@ def scan():
 
 @pytest.mark.parametrize('name', ALGORITHMS)
 def test_what_comes_back(scan, name):
-    found = run_algorithm(scan, quick(name), **inputs(name, scan))
-    assert isinstance(found, Reconstruction) and found.grid == scan.geometry.grid
-    assert found.volume.dtype == np.float32 and found.volume.shape == scan.geometry.grid.shape
-    assert found.seconds > 0
+    result = run_algorithm(scan, quick(name), **inputs(name, scan))
+    assert isinstance(result, Reconstruction) and result.grid == scan.geometry.grid
+    assert result.volume.dtype == np.float32 and result.volume.shape == scan.geometry.grid.shape
+    assert result.seconds > 0
     if name != 'best':  # it chooses its passes
-        assert len(found.residuals) == (0 if name == 'fdk' else 3)
+        assert len(result.residuals) == (0 if name == 'fdk' else 3)
 
 
 def test_as_an_array(scan):
-    found = run_algorithm(scan, FDK())
-    assert np.asarray(found) is found.volume
-    assert np.asarray(found, np.float64).dtype == np.float64 and np.mean(found) == np.mean(found.volume)
-    copied = np.array(found)
+    result = run_algorithm(scan, FDK())
+    assert np.asarray(result) is result.volume
+    assert np.asarray(result, np.float64).dtype == np.float64 and np.mean(result) == np.mean(result.volume)
+    copied = np.array(result)
     copied[:] = 0
-    assert found.volume.any()
+    assert result.volume.any()
 
 
 @pytest.mark.parametrize('name', ITERATIVE)
 def test_a_start_is_anything_that_gives_an_array(scan, name):
     first, algorithm = run_algorithm(scan, FDK()), quick(name)
-    found = run_algorithm(scan, algorithm, start=first.volume)
-    assert np.abs(found.volume - run_algorithm(scan, algorithm).volume).max() > 1e-4
+    result = run_algorithm(scan, algorithm, start=first.volume)
+    assert np.abs(result.volume - run_algorithm(scan, algorithm).volume).max() > 1e-4
     for start in (first, first.volume.astype(float), first.volume.tolist()):
         again = run_algorithm(scan, algorithm, start=start)
-        np.testing.assert_array_equal(again, found)
-    assert found.residuals[0] == again.residuals[0] < 1
+        np.testing.assert_array_equal(again, result)
+    assert result.residuals[0] == again.residuals[0] < 1
 
 
 def test_options_are_fields(scan):
@@ -157,9 +157,9 @@ def test_what_a_run_needs(scan):
     with pytest.raises(InputError, match='completed_niter must be 0 if no completed views are given'):
         run_algorithm(scan, Refined(), start=volume)
     refined = quick('refined')
-    for given in ({}, dict(start=volume, sample=lambda _: volume)):
+    for arrays in ({}, dict(start=volume, sample=lambda _: volume)):
         with pytest.raises(InputError, match='give it as start, or a function for it as sample'):
-            run_algorithm(scan, refined, **given)
+            run_algorithm(scan, refined, **arrays)
     with pytest.raises(InputError, match='give the fit as start'):
         run_algorithm(scan, replace(refined, finer=2), start=volume)
     with pytest.raises(InputError, match='the start volume: shape'):
@@ -172,34 +172,36 @@ def test_what_a_run_needs(scan):
 
 @pytest.mark.parametrize('name', ALGORITHMS)
 def test_progress_counts_the_steps(scan, name):
-    algorithm, told = quick(name), []
-    run_algorithm(scan, algorithm, progress=lambda *said: told.append(said), **inputs(name, scan))
-    assert told[-1][:2] == (algorithm.steps(scan),) * 2 and [done for done, _, _ in told] == sorted(t[0] for t in told)
-    residuals = [residual for _, _, residual in told]
+    algorithm, calls = quick(name), []
+    run_algorithm(scan, algorithm, progress=lambda *call: calls.append(call), **inputs(name, scan))
+    assert calls[-1][:2] == (algorithm.steps(scan),) * 2 and [done for done, _, _ in calls] == sorted(
+        t[0] for t in calls
+    )
+    residuals = [residual for _, _, residual in calls]
     assert all(residual is None or residual > 0 for residual in residuals)
     if name not in ('fdk', 'asd-pocs', 'refined'):  # FDK has none, the others one where it decides
         assert residuals[-1] > 0
     if 'tol' in algorithm.options:
-        told.clear()
-        run_algorithm(scan, replace(algorithm, tol=1e-9), progress=lambda *said: told.append(said))
-        assert all(residual > 0 for _, _, residual in told)
+        calls.clear()
+        run_algorithm(scan, replace(algorithm, tol=1e-9), progress=lambda *call: calls.append(call))
+        assert all(residual > 0 for _, _, residual in calls)
 
 
 def test_progress_of_both_stages(scan):
-    told, refined = [], Refined(niter=2, completed_niter=1, tviter=2)
+    calls, refined = [], Refined(niter=2, completed_niter=1, tviter=2)
     few = scan.subset([0, 2])
     run_algorithm(
-        few, refined, progress=lambda *said: told.append(said), start=np.ones(scan.geometry.grid.shape), completed=scan
+        few, refined, progress=lambda *call: calls.append(call), start=np.ones(scan.geometry.grid.shape), completed=scan
     )
-    assert [said[:2] for said in told] == [(1, 3), (2, 3), (3, 3)] and told[0][2] is None
+    assert [call[:2] for call in calls] == [(1, 3), (2, 3), (3, 3)] and calls[0][2] is None
 
 
 def test_a_bar(scan, capsys):
     algorithm = CGLS(niter=2)
     with progress_bar(algorithm, scan) as progress:
         run_algorithm(scan, algorithm, progress=progress)
-    said = capsys.readouterr().err
-    assert 'cgls: 2/2 (100%)' in said and 'residual' in said
+    text = capsys.readouterr().err
+    assert 'cgls: 2/2 (100%)' in text and 'residual' in text
     with progress_bar(FDK(), scan, 'first look') as progress:
         run_algorithm(scan, FDK(), progress=progress)
     assert 'first look: 5/5 (100%)' in capsys.readouterr().err
@@ -207,9 +209,9 @@ def test_a_bar(scan, capsys):
 
 @pytest.mark.parametrize('name', ALGORITHMS)
 def test_the_front_door_is_the_run(scan, name):
-    given = inputs(name, scan)
-    found = lm.reconstruct(scan, quick(name), progress=False, **given)
-    np.testing.assert_array_equal(found, run_algorithm(scan, quick(name), **given))
+    arrays = inputs(name, scan)
+    result = lm.reconstruct(scan, quick(name), progress=False, **arrays)
+    np.testing.assert_array_equal(result, run_algorithm(scan, quick(name), **arrays))
 
 
 def test_reconstruct_takes_line_integrals_only(scan):
@@ -253,9 +255,9 @@ def test_documentation(name):
     """The examples run, and every option is described."""
     algorithm = ALGORITHMS[name]
     module = importlib.import_module(algorithm.__module__)
-    found = doctest.DocTestFinder(recurse=False).find(algorithm, algorithm.__name__, globs=dict(vars(module)))
+    doctests = doctest.DocTestFinder(recurse=False).find(algorithm, algorithm.__name__, globs=dict(vars(module)))
     runner = doctest.DocTestRunner()
-    assert found[0].examples and runner.run(found[0]).failed == 0
+    assert doctests[0].examples and runner.run(doctests[0]).failed == 0
     words = algorithm.__doc__.replace(',', ' ').split()
     assert all(option in words for option in algorithm().options)
 

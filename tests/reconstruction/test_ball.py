@@ -59,6 +59,6 @@ def check(name, views, options, mode, panel):
     volume = run_algorithm(scan, ALGORITHMS[name](**options)).volume
     assert volume.shape == geo.grid.shape and volume.dtype == np.float32
     density, place = ball_errors(volume, geo)
-    said = ', '.join(f'{name} = {value}' for name, value in options.items())
-    print(f'\n| {name} | {said} | {mode} | {panel} | {100 * density:+.2f} | {place:.3f} |')
+    settings = ', '.join(f'{name} = {value}' for name, value in options.items())
+    print(f'\n| {name} | {settings} | {mode} | {panel} | {100 * density:+.2f} | {place:.3f} |')
     assert_ball(volume, geo)

@@ -46,9 +46,9 @@ def scanned(parts, photons=0.0):
 def test_which_views_are_held_out(views, held):
     geometry = small(n=views)
     scan = Scan(geometry, np.arange(views)[:, None, None] + np.zeros((views, *geometry.nDetector)))
-    kept, out = split_views(scan, 5)
+    fitted, out = split_views(scan, 5)
     assert out.projections[:, 0, 0].tolist() == held
-    assert sorted([*kept.projections[:, 0, 0], *held]) == list(range(views))
+    assert sorted([*fitted.projections[:, 0, 0], *held]) == list(range(views))
 
 
 def test_too_few_views():
@@ -69,13 +69,13 @@ def test_the_score_is_the_error_of_the_volume_smooth_or_not():
     scan, truth = scanned(1)
     rng = np.random.default_rng(1)
     x, y, _ = np.indices(truth.shape) - 11.5
-    measure, system, found, plain = Score(scan), System(scan), [], []
+    measure, system, scores, plain = Score(scan), System(scan), [], []
     for smooth in (4, 2, 1, 0):
         error = gaussian_filter(rng.normal(size=truth.shape), smooth, mode='constant') * (np.hypot(x, y) < 10)
         volume = system.start(truth + error * (0.1 * np.linalg.norm(truth) / np.linalg.norm(error)))
-        found.append(measure(volume))
+        scores.append(measure(volume))
         plain.append(system.residual(volume)[1])
-    assert 0.08 < min(found[:3]) and max(found) < 0.12 and 0.05 < found[3] < 0.067
+    assert 0.08 < min(scores[:3]) and max(scores) < 0.12 and 0.05 < scores[3] < 0.067
     assert plain[0] > 4 * plain[-1]
     assert measure(system.start(truth)) < 1e-4  # float32
 
@@ -84,10 +84,10 @@ def test_the_score_is_the_error_of_the_volume_smooth_or_not():
 def test_finer_voxels_for_finer_objects_only():
     for parts in (1, 2):
         scan, truth = scanned(parts)
-        found = run_algorithm(scan, Best(niter=8))
-        assert found.plan[found.taken].finer == parts
-        assert found.volume.shape == truth.shape
-        assert psnr_3d(found.volume, truth) > psnr_3d(run_algorithm(scan, ASDPOCS(niter=20)).volume, truth) + 1
+        result = run_algorithm(scan, Best(niter=8))
+        assert result.plan[result.taken].finer == parts
+        assert result.volume.shape == truth.shape
+        assert psnr_3d(result.volume, truth) > psnr_3d(run_algorithm(scan, ASDPOCS(niter=20)).volume, truth) + 1
 
 
 @pytest.mark.parametrize('score, taken', [(1.01, 2), (1.03, 1)])
@@ -106,8 +106,8 @@ def test_a_cloud_is_taken_where_it_predicts_the_views_better(right):
             progress(k, 100)
         return lambda geometry: truth if right else np.full_like(truth, truth.mean())
 
-    found = run_algorithm(scan, Best(niter=2, finer=1, cloud=True), fit=fit, progress=lambda k, *_: done.append(k))
-    assert found.plan[-1].cloud and found.plan[found.taken].cloud == right
+    result = run_algorithm(scan, Best(niter=2, finer=1, cloud=True), fit=fit, progress=lambda k, *_: done.append(k))
+    assert result.plan[-1].cloud and result.plan[result.taken].cloud == right
     assert fitted == [16, 20][: 1 + right]  # the views that are kept; all of them, where it is taken
     assert done[:-1] == list(range(1, len(done)))
 
@@ -134,59 +134,59 @@ def test_a_cloud_needs_a_fit():
 @pytest.mark.thorough
 def test_the_cloud_is_fitted():
     scan, truth = scanned(2)
-    found = lm.reconstruct(scan, Best(niter=3, cloud=True), progress=False)
-    assert found.plan[-1].cloud and found.plan[-1].score < found.plan[0].score
-    assert psnr_3d(found.volume, truth) > 30
+    result = lm.reconstruct(scan, Best(niter=3, cloud=True), progress=False)
+    assert result.plan[-1].cloud and result.plan[-1].score < result.plan[0].score
+    assert psnr_3d(result.volume, truth) > 30
 
 
 @pytest.mark.thorough
 def test_noise_stops_it_early():
     clean, noisy = (run_algorithm(scanned(1, photons)[0], Best(niter=8)) for photons in (0, 300.0))
     assert noisy.plan[0].niter < clean.plan[0].niter
-    assert [any(trial.smooth for trial in found.plan) for found in (clean, noisy)] == [False, True]
+    assert [any(trial.smooth for trial in result.plan) for result in (clean, noisy)] == [False, True]
     scan, truth = scanned(1, 300.0)
     assert psnr_3d(noisy.volume, truth) > psnr_3d(run_algorithm(scan, ASDPOCS(niter=20)).volume, truth) + 1
 
 
 def test_with_noise_a_cloud_gets_more_total_variation_too():
     scan, truth = scanned(1, 100.0)
-    found = run_algorithm(
+    result = run_algorithm(
         scan, Best(niter=8, finer=1, cloud=True), fit=lambda part, progress: lambda geometry: 0.9 * truth
     )
-    best = min(found.plan[1:-1], key=lambda trial: trial.score)
-    assert best.smooth and found.plan[-1].smooth and found.plan[-1].name == 'refined, smooth, cloud'
+    best = min(result.plan[1:-1], key=lambda trial: trial.score)
+    assert best.smooth and result.plan[-1].smooth and result.plan[-1].name == 'refined, smooth, cloud'
 
 
 @pytest.mark.thorough
 def test_the_plan_is_told_and_can_be_kept():
     scan, _ = scanned(1)
-    found = run_algorithm(scan, Best(niter=2, finer=1))
-    record, lines = found.record(), found.report().splitlines()
-    assert [line[0] for line in lines].index('*') == found.taken == record['taken']
-    assert len(lines) == len(record['tried']) == len(found.plan)
+    result = run_algorithm(scan, Best(niter=2, finer=1))
+    record, lines = result.record(), result.report().splitlines()
+    assert [line[0] for line in lines].index('*') == result.taken == record['taken']
+    assert len(lines) == len(record['tried']) == len(result.plan)
     for tried in record['tried']:
         assert tried['scores'][tried['niter'] - 1] == tried['score'] == min(tried['scores'])
     again = run_algorithm(replace(scan), Best(niter=2, finer=1))
-    np.testing.assert_array_equal(again.volume, found.volume)
-    np.testing.assert_array_equal(again.error, found.error)
+    np.testing.assert_array_equal(again.volume, result.volume)
+    np.testing.assert_array_equal(again.error, result.error)
 
 
 def test_progress_goes_on_to_the_last_step_but_one():
     """Where trials take more steps than were foreseen, it waits there."""
-    told = []
-    count = Best._counter(lambda done, total, residual: told.append((done, total)), 4)
+    calls = []
+    count = Best._counter(lambda done, total, residual: calls.append((done, total)), 4)
     for _ in range(5):
         count(1, 1, 0.5)
-    assert told == [(1, 4), (2, 4), (3, 4), (3, 4), (3, 4)]
+    assert calls == [(1, 4), (2, 4), (3, 4), (3, 4), (3, 4)]
 
 
 def test_the_map_of_errors():
     volume = np.zeros((9, 9, 9), np.float32)
     other = volume.copy()
     other[4, 4, 4] = 1
-    found = error_map(volume, other)
-    assert found.dtype == np.float32 and found.argmax() == np.ravel_multi_index((4, 4, 4), found.shape)
-    assert abs((found**2).sum() - 1) < 1e-3 and not error_map(volume, volume).any()
+    actual = error_map(volume, other)
+    assert actual.dtype == np.float32 and actual.argmax() == np.ravel_multi_index((4, 4, 4), actual.shape)
+    assert abs((actual**2).sum() - 1) < 1e-3 and not error_map(volume, volume).any()
 
 
 @pytest.fixture(scope='module')
@@ -200,19 +200,19 @@ def finer_scan():
 def test_values_predict_views_and_means_the_truth(finer_scan):
     """The numbers cannot be good at both: see docs/how_to/best.md."""
     scan, rest, truth = finer_scan
-    found = {kind: run_algorithm(scan, Best(niter=4, voxels=kind)) for kind in ('means', 'values', 'finer')}
+    results = {kind: run_algorithm(scan, Best(niter=4, voxels=kind)) for kind in ('means', 'values', 'finer')}
     pocs = run_algorithm(scan, ASDPOCS(niter=50)).volume
 
     def missed(volume, grid):
         return np.sqrt(np.mean((project_volume(volume, rest.geometry.on(grid)) - rest.projections) ** 2))
 
-    wrong = {kind: missed(one.volume, one.grid) for kind, one in found.items()}
-    assert found['means'].meaning == 'means' and found['values'].meaning == 'values'
-    assert found['finer'].grid == scan.geometry.grid.finer(2) and found['finer'].error.shape == (48, 48, 48)
+    wrong = {kind: missed(one.volume, one.grid) for kind, one in results.items()}
+    assert results['means'].meaning == 'means' and results['values'].meaning == 'values'
+    assert results['finer'].grid == scan.geometry.grid.finer(2) and results['finer'].error.shape == (48, 48, 48)
     assert wrong['finer'] < wrong['values'] < min(wrong['means'], missed(pocs, scan.geometry.grid))
-    assert psnr_3d(found['means'].volume, truth) > psnr_3d(found['values'].volume, truth)
-    assert all(trial.output_score is not None for trial in found['values'].plan)
-    np.testing.assert_allclose(means(found['finer'].volume, 2), found['means'].volume, rtol=1e-5, atol=1e-7)
+    assert psnr_3d(results['means'].volume, truth) > psnr_3d(results['values'].volume, truth)
+    assert all(trial.output_score is not None for trial in results['values'].plan)
+    np.testing.assert_allclose(means(results['finer'].volume, 2), results['means'].volume, rtol=1e-5, atol=1e-7)
 
 
 def test_means_over_the_cubes_of_an_interpolation():
@@ -229,10 +229,10 @@ def test_means_over_the_cubes_of_an_interpolation():
 
 def test_a_prior_is_a_candidate():
     scan, _ = scanned(1, 300.0)
-    found = run_algorithm(scan, Best(niter=2, finer=1, prior=lm.TV()))
-    trial = found.plan[-1]
-    assert trial.name == 'pls, TV' and 0 < trial.strength <= 1e-2 and 'strength' in found.report()
-    assert found.taken == len(found.plan) - 1  # noise, and an object of uniform parts
+    result = run_algorithm(scan, Best(niter=2, finer=1, prior=lm.TV()))
+    trial = result.plan[-1]
+    assert trial.name == 'pls, TV' and 0 < trial.strength <= 1e-2 and 'strength' in result.report()
+    assert result.taken == len(result.plan) - 1  # noise, and an object of uniform parts
 
 
 @pytest.mark.parametrize(

@@ -142,8 +142,8 @@ def test_filtering_in_other_units(mode):
     grid = replace(once.grid, spacing=np.multiply(once.grid.spacing, 2), centre=np.multiply(once.grid.centre, 2))
     twice = replace(once, grid=grid, **{name: np.multiply(getattr(once, name), 2) for name in lengths})
     projections = np.random.default_rng(0).random((3, *once.nDetector), dtype=np.float32)
-    found, expected = filtered(projections, twice), filtered(projections, once) / 2
-    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
+    actual, expected = filtered(projections, twice), filtered(projections, once) / 2
+    np.testing.assert_allclose(actual, expected, atol=1e-6 * np.abs(expected).max())
 
 
 @pytest.mark.parametrize('side', ['u', 'v'])

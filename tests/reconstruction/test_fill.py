@@ -34,10 +34,10 @@ def test_filled_pixels(scan, kind, share):
     """To a tenth of their values, rms; a whole row or view to a fifth. What was measured stays."""
     valid = kinds(scan)[kind]
     with pytest.warns(UserWarning, match='that are not valid were filled'):
-        found = filled(replace(scan, valid=valid))
-    assert found.valid is None
-    np.testing.assert_array_equal(found.projections[valid], scan.projections[valid])
-    error = found.projections - scan.projections
+        actual = filled(replace(scan, valid=valid))
+    assert actual.valid is None
+    np.testing.assert_array_equal(actual.projections[valid], scan.projections[valid])
+    error = actual.projections - scan.projections
     assert np.std(error[~valid]) < share * np.sqrt(np.square(scan.projections[~valid]).mean())
 
 
@@ -47,12 +47,12 @@ def test_one_dead_pixel_does_not_stop_fdk(scan):
     valid[:, 50, 45] = False
     holed = replace(scan, valid=valid)
     with pytest.warns(UserWarning, match=r'^60 pixels \(.* of all\) .*; fill=false refuses'):
-        found = lm.reconstruct(holed, lm.FDK(), progress=False).volume
+        volume = lm.reconstruct(holed, lm.FDK(), progress=False).volume
     whole = lm.reconstruct(scan, lm.FDK(), progress=False).volume
-    assert 0 < np.abs(found - whole).max() < 0.02 * whole.max()
+    assert 0 < np.abs(volume - whole).max() < 0.02 * whole.max()
     with pytest.warns(UserWarning, match='were filled'):
         slabs = np.concatenate(list(lm.FDK().slabs(holed, 16)), 2)
-    np.testing.assert_allclose(slabs, found, atol=1e-5 * whole.max())
+    np.testing.assert_allclose(slabs, volume, atol=1e-5 * whole.max())
     with pytest.raises(lm.InputError, match='needs every pixel'):
         lm.reconstruct(holed, lm.FDK(fill=False), progress=False)
     with pytest.raises(lm.InputError, match='fill'):

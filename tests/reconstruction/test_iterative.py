@@ -91,9 +91,9 @@ def test_weighted_sart_is_that_of_the_scaled_system(system, blocksize):
             x, A, b, 0.8 * 0.9**k, [np.arange(i, min(i + blocksize, 5)) for i in range(0, 5, blocksize)], s=s.ravel()
         )
     for factor in (1, 1e-3):
-        found = run_algorithm(scan, OSSART(3, blocksize, 0.8, 0.9, True, 'ordered'), start=start, weights=factor * s)
-        close(found, x)
-        np.testing.assert_array_equal(found.volume[:2], np.float32(start[:2]))
+        result = run_algorithm(scan, OSSART(3, blocksize, 0.8, 0.9, True, 'ordered'), start=start, weights=factor * s)
+        close(result, x)
+        np.testing.assert_array_equal(result.volume[:2], np.float32(start[:2]))
     ones = np.full_like(s, 3)
     two = ASDPOCS(2)
     np.testing.assert_allclose(run_algorithm(scan, two, weights=ones), run_algorithm(scan, two), atol=1e-5)
@@ -167,9 +167,9 @@ def test_order_strategy(system, strategy):
 @pytest.mark.parametrize('name', ['sart', 'sirt', 'asd-pocs'])
 def test_noneg(system, name):
     scan = replace(system[0], projections=system[0].projections - system[0].projections.mean())
-    kept, free = (run_algorithm(scan, ITERATIVE[name](niter=2, noneg=noneg)).volume for noneg in (True, False))
+    bounded, free = (run_algorithm(scan, ITERATIVE[name](niter=2, noneg=noneg)).volume for noneg in (True, False))
     assert free.min() < -0.1 * free.max()
-    assert kept.min() >= (-0.01 * kept.max() if name == 'asd-pocs' else 0)  # whose descent comes after
+    assert bounded.min() >= (-0.01 * bounded.max() if name == 'asd-pocs' else 0)  # whose descent comes after
 
 
 def test_cgls_is_lsqr_and_its_residual_falls(system):
@@ -237,9 +237,9 @@ def test_asd_pocs_is_the_transcription(system):
         if decides[-1] and errors[-1] > maxl2err:
             step *= 0.5
         lmbda *= 0.95
-    computed = np.isfinite(found := np.array(result.residuals[1:]))
+    computed = np.isfinite(actual := np.array(result.residuals[1:]))
     assert computed.tolist() == [*decides[:-1], True] and not all(decides[:-1])
-    np.testing.assert_allclose(found[computed], np.array(errors)[computed] / np.linalg.norm(b), rtol=1e-3)
+    np.testing.assert_allclose(actual[computed], np.array(errors)[computed] / np.linalg.norm(b), rtol=1e-3)
     np.testing.assert_allclose(result.volume.ravel(), x, atol=2e-3 * np.abs(x).max())
 
 
@@ -367,11 +367,11 @@ def test_refined_puts_what_is_missing_where_the_structure_is():
     geo = default_geometry(made, circular(12, 180.0), 96)
     scan = Scan(geo, project_volume(made.data, geo))
     start = np.asarray(gaussian_filter(made.data, 1), np.float32)
-    found = run_algorithm(scan, Refined(4, 0, 1), completed=scan, sample=lambda _: start).volume
+    volume = run_algorithm(scan, Refined(4, 0, 1), completed=scan, sample=lambda _: start).volume
     alike = ASDPOCS(4, tviter=1, alpha=0.12, alpha_red=0.87, rmax=0.65, maxl2err=0.0, exact_every=5)
     alike = run_algorithm(scan, alike, start=start).volume
-    assert psnr_3d_r2(found, made.data) > psnr_3d_r2(alike, made.data) + 1, [
-        psnr_3d_r2(v, made.data) for v in (found, alike, start)
+    assert psnr_3d_r2(volume, made.data) > psnr_3d_r2(alike, made.data) + 1, [
+        psnr_3d_r2(v, made.data) for v in (volume, alike, start)
     ]
 
 
@@ -387,11 +387,11 @@ def test_smaller_voxels_hold_what_an_object_has_between_them():
     def sample(grid):
         return np.kron(means, np.ones(np.array(grid.shape) // means.shape))
 
-    found = [
+    result = [
         psnr_3d_r2(run_algorithm(coarse, Refined(3, 1, 5, finer=finer), completed=coarse, sample=sample).volume, means)
         for finer in (1, 2)
     ]
-    assert found[1] > found[0] + 3, found
+    assert result[1] > result[0] + 3, result
 
 
 def test_no_kernel_is_compiled_after_the_first_iterations(system):
@@ -456,5 +456,5 @@ def test_passes_between_corrections(system, monkeypatch, every, times):
 
 def test_blocks_go_by_their_middle_view():
     """At 10, 40 and 120 degrees; the first views of the blocks would give another order."""
-    found = blocks(np.radians([0, 10, 170, 40, 60, 120]), 2, 'angularDistance', np.random.default_rng(0))
-    assert [b.tolist() for b in found] == [[0, 1], [4, 5], [2, 3]]
+    actual = blocks(np.radians([0, 10, 170, 40, 60, 120]), 2, 'angularDistance', np.random.default_rng(0))
+    assert [b.tolist() for b in actual] == [[0, 1], [4, 5], [2, 3]]

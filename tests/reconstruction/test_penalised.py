@@ -30,9 +30,9 @@ def variation(z):
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_a_ball(mode):
     geo = geometry(mode, circular(40, start=3))
-    found = run_algorithm(ellipsoids(geo, BALL), PenalisedLeastSquares(strength=1e-4, niter=150))
-    assert_ball(found.volume, geo)
-    assert len(found.residuals) == 151 and found.residuals[0] == 1 and found.residuals[-1] < 0.06
+    result = run_algorithm(ellipsoids(geo, BALL), PenalisedLeastSquares(strength=1e-4, niter=150))
+    assert_ball(result.volume, geo)
+    assert len(result.residuals) == 151 and result.residuals[0] == 1 and result.residuals[-1] < 0.06
 
 
 @pytest.fixture(scope='module')
@@ -95,7 +95,7 @@ def test_gradients_and_weights(weights):
         def gradient(self, x, size):
             return x
 
-    found = run_algorithm(
+    result = run_algorithm(
         lm.Scan(geo, b.astype(np.float32)),
         PenalisedLeastSquares(Small(), strength=0.02, niter=250, upper=0.9, weights=weights),
     )
@@ -105,7 +105,7 @@ def test_gradients_and_weights(weights):
     strength = 0.02 * (matrix.T @ (root**2 * flat)).max()
     full = np.vstack([root[:, None] * matrix, np.sqrt(strength) * np.eye(100)])
     expected = lsq_linear(full, np.r_[root * flat, np.zeros(100)], (0, 0.9), tol=1e-12).x
-    np.testing.assert_allclose(found.volume.ravel(), expected, atol=2e-4)
+    np.testing.assert_allclose(result.volume.ravel(), expected, atol=2e-4)
     assert 0 < (expected < 1e-9).sum() < 100 and (expected > 0.9 - 1e-9).any()
 
 
@@ -136,11 +136,11 @@ def test_a_denoiser_is_a_prior(scan):
         strengths.append(strength)
         return denoise_tv_chambolle(volume, weight=5 * strength)
 
-    found = lm.reconstruct(
+    result = lm.reconstruct(
         scan, lm.PenalisedLeastSquares(lm.Denoiser(denoiser), strength=3e-4, niter=30), progress=False
     )
     plain = lm.reconstruct(scan, lm.PenalisedLeastSquares(strength=0.0, niter=30), progress=False)
-    assert found.metrics(truth)['psnr_3d'] > plain.metrics(truth)['psnr_3d'] + 1
+    assert result.metrics(truth)['psnr_3d'] > plain.metrics(truth)['psnr_3d'] + 1
     assert len(strengths) == 30 and len(set(strengths)) == 1
 
 

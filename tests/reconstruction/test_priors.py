@@ -34,11 +34,11 @@ def noisy():
 def test_differences_and_their_transpose():
     rng = np.random.default_rng(0)
     z, p = rng.normal(size=SIZE).astype(np.float32), rng.normal(size=(3, *SIZE)).astype(np.float32)
-    found = np.array([d.numpy().reshape(SIZE) for d in differences(uploaded(z), SIZE)])
+    actual = np.array([d.numpy().reshape(SIZE) for d in differences(uploaded(z), SIZE)])
     expected = np.array([np.diff(z, axis=a, append=z.take([-1], a)) for a in range(3)])
-    np.testing.assert_allclose(found, expected, atol=1e-6)
+    np.testing.assert_allclose(actual, expected, atol=1e-6)
     back = transposed([uploaded(c) for c in p], SIZE).numpy().reshape(SIZE)
-    assert np.vdot(found, p) == pytest.approx(np.vdot(z, back), rel=1e-5)
+    assert np.vdot(actual, p) == pytest.approx(np.vdot(z, back), rel=1e-5)
 
 
 @pytest.mark.parametrize('upper', [np.inf, 0.7])
@@ -80,17 +80,17 @@ def lengths(d, epsilon=1e-3):
     return np.sqrt((d**2).sum(0) + epsilon**2).sum() - epsilon * d[0].size
 
 
-def assert_least(cost, found, bounded):
+def assert_least(cost, actual, bounded):
     """A convex function's least: a general solver gets no lower from there, nor do steps at random. The first `bounded` unknowns
     are not negative."""
-    bounds = [(0, None)] * bounded + [(None, None)] * (found.size - bounded)
-    lower = minimize(cost, found.astype(float), bounds=bounds, method='L-BFGS-B', options=dict(maxfun=2500))
-    assert cost(found) < lower.fun * 1.002
+    bounds = [(0, None)] * bounded + [(None, None)] * (actual.size - bounded)
+    lower = minimize(cost, actual.astype(float), bounds=bounds, method='L-BFGS-B', options=dict(maxfun=2500))
+    assert cost(actual) < lower.fun * 1.002
     rng = np.random.default_rng(1)
     for size in [0.003] * 100 + [0.03] * 100:
-        other = found + size * rng.normal(size=found.size)
+        other = actual + size * rng.normal(size=actual.size)
         other[:bounded] = np.maximum(other[:bounded], 0)
-        assert cost(other) > cost(found) * 0.9998
+        assert cost(other) > cost(actual) * 0.9998
 
 
 def tiny_prox(prior, x, strength):
@@ -114,12 +114,12 @@ def along(direction, weight):
 @pytest.mark.parametrize('weight', [0.3, 3.0])
 def test_directional_total_variation_is_the_least(tiny, weight):
     field = along((1, 2, 0), weight)
-    found = tiny_prox(DirectionalTV(inner=300, direction=(1, 2, 0), weight=weight), tiny, 0.1)
+    actual = tiny_prox(DirectionalTV(inner=300, direction=(1, 2, 0), weight=weight), tiny, 0.1)
     assert_least(
-        lambda z: 0.5 * ((z - tiny.ravel()) ** 2).sum() + 0.1 * lengths(field(z.reshape(TINY))), found.ravel(), 24
+        lambda z: 0.5 * ((z - tiny.ravel()) ** 2).sum() + 0.1 * lengths(field(z.reshape(TINY))), actual.ravel(), 24
     )
     plain = tiny_prox(TV(inner=200), tiny, 0.1)
-    assert np.abs(found - plain).max() > 0.02
+    assert np.abs(actual - plain).max() > 0.02
     np.testing.assert_allclose(tiny_prox(DirectionalTV(inner=200, weight=1.0), tiny, 0.1), plain, atol=1e-5)
 
 
@@ -148,10 +148,10 @@ def test_generalised_variation_is_the_least(tiny):
         return 0.5 * ((z - tiny) ** 2).sum() + 0.1 * lengths(steps(z) - v) + 0.15 * lengths(second_derivatives(v))
 
     prior = TGV(second=1.5, inner=600)
-    found = tiny_prox(prior, tiny, 0.1)
+    actual = tiny_prox(prior, tiny, 0.1)
     field = np.concatenate([c.numpy() for c in prior._state[0]])
-    assert_least(cost, np.r_[found.ravel(), field], 24)
-    assert np.abs(found - tiny_prox(TV(inner=200), tiny, 0.1)).max() > 0.01
+    assert_least(cost, np.r_[actual.ravel(), field], 24)
+    assert np.abs(actual - tiny_prox(TV(inner=200), tiny, 0.1)).max() > 0.01
 
 
 def test_slopes_cost_nothing():
@@ -203,8 +203,8 @@ def test_wavelets_are_a_soft_threshold(noisy, shifts):
     offset = np.random.default_rng(0).integers(0, 4, 3) if shifts else (0, 0, 0)
 
     def coefficients(v):
-        kept = pywt.wavedecn(np.roll(v, offset, (0, 1, 2)), 'db2', 'periodization', 2)
-        return kept[0], np.concatenate([c.ravel() for scale in kept[1:] for c in scale.values()])
+        decomposed = pywt.wavedecn(np.roll(v, offset, (0, 1, 2)), 'db2', 'periodization', 2)
+        return decomposed[0], np.concatenate([c.ravel() for scale in decomposed[1:] for c in scale.values()])
 
     (coarse, fine), (coarse_z, fine_z) = coefficients(x), coefficients(z)
     np.testing.assert_allclose(coarse, coarse_z, atol=1e-4)
@@ -228,8 +228,8 @@ def test_a_sum_is_the_least(tiny):
         return 0.5 * ((z - tiny) ** 2).sum() + 0.05 * lengths(steps(z)) + 0.025 * lengths(field(z))
 
     parts = TV(inner=20), DirectionalTV(inner=20, direction=(0, 1, 0), weight=4.0), Huber(0.1)
-    found = tiny_prox(PriorSum(parts, weights=(1, 0.5, 2), inner=30), tiny, 0.05)
-    assert_least(cost, found.ravel(), 24)
+    actual = tiny_prox(PriorSum(parts, weights=(1, 0.5, 2), inner=30), tiny, 0.05)
+    assert_least(cost, actual.ravel(), 24)
 
 
 def test_a_sum_of_one_and_of_gradients(noisy):

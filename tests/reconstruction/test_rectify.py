@@ -165,5 +165,5 @@ def test_other_motions_are_refused(mode, motion, says):
 @pytest.mark.parametrize('degrees', [(3.0, 0.0, 0.0), (0.0, 2.0, 0.0)])
 def test_the_upright_panel_stands_where_the_real_one_is(degrees):
     geo = geometry('cone', circular(6))
-    found = rectified_geometry(moved(geo, degrees))
-    assert found.DSO == pytest.approx(geo.DSO) and found.DSD == pytest.approx(geo.DSD, rel=2e-3)
+    actual = rectified_geometry(moved(geo, degrees))
+    assert actual.DSO == pytest.approx(geo.DSO) and actual.DSD == pytest.approx(geo.DSD, rel=2e-3)

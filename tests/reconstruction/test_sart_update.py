@@ -38,9 +38,9 @@ def test_a_replayed_update_is_the_traced_one(voxels, panel, views, weighted):
     algorithm = OSSART(niter=3, blocksize=2, lmbda=0.7)
     with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, False):
         traced = run_algorithm(measured, algorithm, weights=weights)
-    found = run_algorithm(measured, algorithm, weights=weights)
-    assert found.residuals == traced.residuals and found.residuals[-1] < found.residuals[0]
-    np.testing.assert_array_equal(found.volume, traced.volume)
+    result = run_algorithm(measured, algorithm, weights=weights)
+    assert result.residuals == traced.residuals and result.residuals[-1] < result.residuals[0]
+    np.testing.assert_array_equal(result.volume, traced.volume)
 
 
 def test_scans_of_one_size_share_a_recording(monkeypatch):
@@ -56,5 +56,5 @@ def test_threads_share_a_recording(monkeypatch):
     alone = run_algorithm(measured, algorithm).volume
     monkeypatch.setattr(sart_update, '_REPLAY', Replay(sart_update._replayed))
     with ThreadPoolExecutor(4) as pool:
-        for found in pool.map(lambda s: run_algorithm(s, algorithm), [measured] * 8):
-            np.testing.assert_array_equal(found.volume, alone)
+        for result in pool.map(lambda s: run_algorithm(s, algorithm), [measured] * 8):
+            np.testing.assert_array_equal(result.volume, alone)

@@ -38,9 +38,9 @@ def levels(path):
     return [np.asarray(group[str(i)]) for i in range(len(list(group.array_keys())))]
 
 
-def require_same(found, wanted):
-    assert sorted(p.name for p in found.iterdir()) == sorted(p.name for p in wanted.iterdir())
-    for a, b in zip(levels(found), levels(wanted), strict=True):
+def require_same(actual, wanted):
+    assert sorted(p.name for p in actual.iterdir()) == sorted(p.name for p in wanted.iterdir())
+    for a, b in zip(levels(actual), levels(wanted), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -71,8 +71,8 @@ def test_stored_views(scan, tmp_path, algorithm, monkeypatch):
     assert not numbers
     lm.reconstruct(stored, algorithm, slab=64, out=tmp_path / 'one.ome.zarr', progress=False)
     run_in_slabs(stored, algorithm, tmp_path / 'many.ome.zarr', 64, runner=InProcess())
-    for found in 'one.ome.zarr', 'many.ome.zarr':
-        require_same(tmp_path / found, tmp_path / 'wanted.ome.zarr')
+    for name in 'one.ome.zarr', 'many.ome.zarr':
+        require_same(tmp_path / name, tmp_path / 'wanted.ome.zarr')
     assert 0 < max(numbers) <= 4 and 'projections' not in vars(stored)
     (tmp_path / 'scan.zarr' / 'c' / '0' / '0' / '0').unlink()
     with pytest.raises(InputError, match='scan.zarr: lacks a chunk of the views 0 to 3'):

@@ -18,16 +18,16 @@ def scan():
     return slanted_scan()
 
 
-def relative(found, whole):
-    return np.linalg.norm(found - whole) / np.linalg.norm(whole)
+def relative(actual, whole):
+    return np.linalg.norm(actual - whole) / np.linalg.norm(whole)
 
 
 @pytest.mark.parametrize('thickness', [3, 16])
 def test_slabs_are_the_whole_volume(scan, tmp_path, thickness):
     how, steps = ASDPOCS(niter=2, tviter=4, blocksize=5), []
     slabs = how.slabs(scan, thickness, tmp_path / 'work', progress=lambda *step: steps.append(step))
-    found, whole = np.concatenate(list(slabs), 2), run_algorithm(scan, how).volume
-    assert relative(found, whole) < 1e-5 and np.abs(found - whole).max() < 1e-5 * whole.max()
+    actual, whole = np.concatenate(list(slabs), 2), run_algorithm(scan, how).volume
+    assert relative(actual, whole) < 1e-5 and np.abs(actual - whole).max() < 1e-5 * whole.max()
     count = how.slab_steps(scan, thickness)
     assert [step[:2] for step in steps] == [(i + 1, count) for i in range(count)]
     assert {path.name for path in (tmp_path / 'work').iterdir()} >= {'even.f32', 'fourth.f32', 'state.json'}
@@ -41,10 +41,10 @@ def test_the_step_shrinks_as_for_the_whole(scan, tmp_path, maxl2err):
     variation jumps where the volume is even, which turns the slabs' rounding into 1e-5 to 1e-3; a step of another length, into
     more than 1e-2."""
     how = ASDPOCS(niter=3, tviter=2, blocksize=5, alpha=0.5, alpha_red=0.2, rmax=0.1, maxl2err=maxl2err)
-    found = np.concatenate(list(how.slabs(scan, 6, tmp_path / 'work')), 2)
+    volume = np.concatenate(list(how.slabs(scan, 6, tmp_path / 'work')), 2)
     other = ASDPOCS(**how.options | dict(maxl2err=0.0 if maxl2err == 1e9 else 1e9))
     volumes = [run_algorithm(scan, a).volume for a in (how, other)]
-    assert relative(found, volumes[0]) < 2e-3
+    assert relative(volume, volumes[0]) < 2e-3
     assert maxl2err is None or relative(*volumes) > 1e-2
 
 
@@ -65,18 +65,18 @@ def test_work_goes_on_to_the_same_bits(scan, tmp_path, last):
     with pytest.raises(Stop):
         list(how.slabs(scan, 8, tmp_path / 'b', progress=stop))
     steps = []
-    found = list(how.slabs(scan, 8, tmp_path / 'b', progress=lambda done, *_: steps.append(done)))
-    np.testing.assert_array_equal(np.concatenate(found, 2), np.concatenate(whole, 2))
+    slabs = list(how.slabs(scan, 8, tmp_path / 'b', progress=lambda done, *_: steps.append(done)))
+    np.testing.assert_array_equal(np.concatenate(slabs, 2), np.concatenate(whole, 2))
     assert steps[0] == (last - 1) // 2 * 2 + 1
 
 
 def test_an_early_end(scan, tmp_path):
     how = ASDPOCS(niter=4, tviter=1, blocksize=9, lmbda=0.008, lmbda_red=0.5, maxl2err=0.0)
-    found = np.concatenate(list(how.slabs(scan, 8, tmp_path)), 2)
+    volume = np.concatenate(list(how.slabs(scan, 8, tmp_path)), 2)
     assert json.loads((tmp_path / 'state.json').read_text())['updates'] == 2
-    assert relative(found, run_algorithm(scan, how).volume) < 1e-5
+    assert relative(volume, run_algorithm(scan, how).volume) < 1e-5
     again = how.slabs(scan, 8, tmp_path, progress=lambda *_: pytest.fail('computed again'))
-    np.testing.assert_array_equal(np.concatenate(list(again), 2), found)
+    np.testing.assert_array_equal(np.concatenate(list(again), 2), volume)
 
 
 def test_bad_input(scan, tmp_path, monkeypatch):

@@ -32,8 +32,8 @@ def scan():
     return slanted_scan()
 
 
-def difference(found, whole):
-    return np.abs(np.concatenate(list(found), 2) - whole).max() / np.abs(whole).max()
+def difference(actual, whole):
+    return np.abs(np.concatenate(list(actual), 2) - whole).max() / np.abs(whole).max()
 
 
 @pytest.mark.parametrize(
@@ -88,8 +88,8 @@ def test_work_goes_on_to_the_same_bits(scan, tmp_path, last):
     with pytest.raises(Stop):
         list(how.slabs(scan, 6, tmp_path / 'b', progress=stop))
     steps = []
-    found = list(how.slabs(scan, 6, tmp_path / 'b', progress=lambda done, *_: steps.append(done)))
-    np.testing.assert_array_equal(np.concatenate(found, 2), np.concatenate(whole, 2))
+    slabs = list(how.slabs(scan, 6, tmp_path / 'b', progress=lambda done, *_: steps.append(done)))
+    np.testing.assert_array_equal(np.concatenate(slabs, 2), np.concatenate(whole, 2))
     assert steps[0] == (last - 1) // 3 * 3 + 1  # three slabs an update
 
 
@@ -102,8 +102,8 @@ def test_the_volume_stays(scan, tmp_path):
     first = next(taken)
     taken.close()
     for _ in range(2):
-        found = list(how.slabs(scan, 6, work, progress=lambda *_: pytest.fail('computed again')))
-        np.testing.assert_array_equal(found[0], first)
+        slabs = list(how.slabs(scan, 6, work, progress=lambda *_: pytest.fail('computed again')))
+        np.testing.assert_array_equal(slabs[0], first)
     discard(work)
     assert not work.exists()
 
@@ -213,8 +213,8 @@ def test_the_command(tmp_path):
     assert not out.exists()
     code, text, err = run(RECONSTRUCT, scene, *options, '--slab', 8, '--out', out)
     assert code == 0 and str(out) in text and not work.exists(), err
-    whole, found = read_volume(tmp_path / 'whole.nii.gz').data, read_volume(out).data
-    assert np.abs(found - whole).max() < 1e-5 * whole.max()
+    whole, actual = read_volume(tmp_path / 'whole.nii.gz').data, read_volume(out).data
+    assert np.abs(actual - whole).max() < 1e-5 * whole.max()
     code, _, err = run(RECONSTRUCT, scene, *options, '--slab', 8, '--start', 'x.xml', '--out', out, '--force')
     assert code == 2 and 'leave out --start' in err
 

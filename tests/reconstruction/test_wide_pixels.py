@@ -60,10 +60,10 @@ def test_voxels_between_rays(algorithm):
     A = Joseph(geo)
     crossed = A.adjoint(dr.ones(mi.Float, 30 * A.pixels), np.arange(30)).numpy().reshape(geo.grid.shape) > 0
     assert not crossed[11:13, 11:13, 10:26].all() and not crossed[:, :, 0].any()
-    found = run_algorithm(Scan(geo, project_volume(made.data, geo)), algorithm(8)).volume
-    centre = found[11:13, 11:13, 9:27]
+    volume = run_algorithm(Scan(geo, project_volume(made.data, geo)), algorithm(8)).volume
+    centre = volume[11:13, 11:13, 9:27]
     assert np.abs(centre - 1).max() < 0.03, centre[0, 0]
-    assert found[:, :, :5].max() < (0.03 if algorithm is ASDPOCS else 1e-6)
+    assert volume[:, :, :5].max() < (0.03 if algorithm is ASDPOCS else 1e-6)
 
 
 def test_wide_pixels_leave_no_pattern():
@@ -74,9 +74,9 @@ def test_wide_pixels_leave_no_pattern():
     scan = Scan(geo, project_volume(made.data, geo))
     wrong = np.float32(0.1 * made.data.max()) * np.asarray(gaussian_filter(np.float32(made.data > 0), 3), np.float32)
     start = made.data + wrong
-    found = run_algorithm(scan, Refined(4, 0, 1), completed=scan, sample=lambda _: start).volume
+    volume = run_algorithm(scan, Refined(4, 0, 1), completed=scan, sample=lambda _: start).volume
     plain = ASDPOCS(4, tviter=1, alpha=0.12, alpha_red=0.87, rmax=0.65, maxl2err=0.0, exact_every=5)
     plain = run_algorithm(scan, plain, start=start, weights=structure(start)).volume
-    assert psnr_3d_r2(found, made.data) > psnr_3d_r2(plain, made.data) + 0.5, [
-        psnr_3d_r2(v, made.data) for v in (found, plain, start)
+    assert psnr_3d_r2(volume, made.data) > psnr_3d_r2(plain, made.data) + 0.5, [
+        psnr_3d_r2(v, made.data) for v in (volume, plain, start)
     ]

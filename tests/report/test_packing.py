@@ -51,10 +51,10 @@ def test_bits_are_as_many_as_the_budget_allows():
 
 def test_a_map_of_errors_is_on_the_grid_of_its_volumes():
     noise, arrays = np.random.default_rng(0).random((51, 51, 51)).astype(np.float32), Arrays()
-    known = slice_payload({'a': noise, 'b': 1 - noise}, (1, 1, 1), (0, 0, 0), arrays, budget=3e4)
-    assert known['preview'] > 1
-    error_maps({'map': noise}, known, arrays)
-    assert list(arrays['map0'].shape) == known['shape']
+    payload = slice_payload({'a': noise, 'b': 1 - noise}, (1, 1, 1), (0, 0, 0), arrays, budget=3e4)
+    assert payload['preview'] > 1
+    error_maps({'map': noise}, payload, arrays)
+    assert list(arrays['map0'].shape) == payload['shape']
 
 
 def test_places_of_a_volume_that_is_a_preview_already():
@@ -62,10 +62,10 @@ def test_places_of_a_volume_that_is_a_preview_already():
     volume = np.random.default_rng(0).random(shape).astype(np.float32)
     full = slice_payload({'a': volume}, spacing, centre, Arrays())
     small, by = preview(volume, 100)
-    known = slice_payload({'a': small}, spacing, centre, Arrays(), of=(shape, by))
-    assert known['preview'] == by and known['spacing'] == [by * s for s in spacing]
+    payload = slice_payload({'a': small}, spacing, centre, Arrays(), of=(shape, by))
+    assert payload['preview'] == by and payload['spacing'] == [by * s for s in spacing]
     first = [c - (n - 1) / 2 * s for c, n, s in zip(full['centre'], full['shape'], full['spacing'])]  # a voxel's centre
-    block = [c - (n - 1) / 2 * s for c, n, s in zip(known['centre'], known['shape'], known['spacing'])]
+    block = [c - (n - 1) / 2 * s for c, n, s in zip(payload['centre'], payload['shape'], payload['spacing'])]
     np.testing.assert_allclose(block, [f + (by - 1) / 2 * s for f, s in zip(first, spacing)])
 
 
@@ -83,10 +83,10 @@ def test_the_worst_volume_stays_within_the_budget(size):
     rng = np.random.default_rng(0)
     budget, arrays = 20e6 * (size / 256) ** 3, Arrays()
     volumes = {name: rng.random((size, size, size), dtype=np.float32) for name in ('Reconstruction', 'Truth')}
-    known = slice_payload(volumes, (1, 1, 1), (0, 0, 0), arrays, 'Truth', budget)
-    assert sum(len(a.text) for a in arrays.values()) <= 1.02 * budget and known['preview'] == 2
+    payload = slice_payload(volumes, (1, 1, 1), (0, 0, 0), arrays, 'Truth', budget)
+    assert sum(len(a.text) for a in arrays.values()) <= 1.02 * budget and payload['preview'] == 2
     half = size // 2
-    assert known['shape'] == [half] * 3 and known['spacing'] == [2, 2, 2] and known['centre'] == [0, 0, 0]
+    assert payload['shape'] == [half] * 3 and payload['spacing'] == [2, 2, 2] and payload['centre'] == [0, 0, 0]
 
 
 def test_budgets_leave_room():

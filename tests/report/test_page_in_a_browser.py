@@ -25,7 +25,7 @@ def content(**changes):
         dict(iteration=i, seconds=i / 7, loss=1 / (1 + i), psnr_2d=20.0 + i, psnr_3d=10.0 + i, gaussians=100 + i)
         for i in (1, 2, 5, 9)
     ]
-    given = dict(
+    fields = dict(
         title=MARKUP,
         volume=truth + rng.normal(0, 0.01, SHAPE),
         truth=truth,
@@ -51,7 +51,7 @@ def content(**changes):
             residual_by_view=[1.0, 2, 3, 4, 5, 6, 7],
         ),
     )
-    return ReportData(**{**given, **changes})
+    return ReportData(**{**fields, **changes})
 
 
 @pytest.fixture(scope='module')
@@ -66,14 +66,14 @@ def address(data, tmp_path_factory):
 
 @pytest.fixture(scope='module')
 def chromium():
-    with browser() as found:
-        yield found
+    with browser() as started:
+        yield started
 
 
 @pytest.fixture
 def page(chromium, address):
-    with opened(chromium, address) as found:
-        yield found
+    with opened(chromium, address) as opened_page:
+        yield opened_page
 
 
 def at(page):
@@ -91,7 +91,7 @@ def press(page, *keys):
 
 
 def test_it_opens_from_disk_and_asks_for_nothing(page, address):
-    assert page.asked == [address]
+    assert page.addresses == [address]
     for part in ('slices', 'views', 'space', 'curves'):
         assert page.locator(f'#{part}').is_visible(), part
     assert page.title() == MARKUP and page.locator('h1').text_content() == MARKUP
@@ -102,8 +102,8 @@ def test_a_part_that_cannot_be_shown_leaves_the_others_alone(chromium, address):
     with opened(chromium, address, first='IntersectionObserver = undefined') as page:
         assert page.locator('#space').text_content().startswith('In spaceThis part could not be shown: ')
         assert page.locator('#slices canvas.picture').count() == 3 and page.locator('#curves .chart').count() == 3
-        assert [said.split(':')[0] for said in page.said] == ['space could not be shown']
-        page.said.clear()
+        assert [message.split(':')[0] for message in page.messages] == ['space could not be shown']
+        page.messages.clear()
 
 
 WITHOUT_WEBGL = """const { getContext } = HTMLCanvasElement.prototype;
@@ -117,7 +117,7 @@ def test_a_browser_without_webgl(chromium, address):
         page.locator('#space').scroll_into_view_if_needed()
         page.locator('#space', has_text='This browser has no WebGL').wait_for()
         assert page.locator('#slices canvas.picture').count() == 3
-        page.said.clear()  # three.js says it too
+        page.messages.clear()  # three.js says it too
 
 
 def test_a_script_that_is_not_its_own_is_refused(chromium, data, tmp_path):
@@ -140,12 +140,12 @@ def test_values_at_the_crosshair_are_those_of_the_volume(page, data):
     page.focus('[data-axis="2"]')
     for keys in ([], ['PageUp', 'ArrowLeft'], ['ArrowUp', 'ArrowUp', 'ArrowUp'], ['Home', 'Shift+PageUp']):
         press(page, *keys)
-        found, index = readout(page), at(page)
+        shown, index = readout(page), at(page)
         for name, volume in (('Reconstruction', data.volume), ('Truth', data.truth)):
-            assert abs(float(found[name]) - volume[index]) <= step
-        assert abs(float(found['Difference']) - (data.volume - data.truth)[index]) <= 2 * step
+            assert abs(float(shown[name]) - volume[index]) <= step
+        assert abs(float(shown['Difference']) - (data.volume - data.truth)[index]) <= 2 * step
         place = [CENTRE[a] + (index[a] + 0.5 - SHAPE[a] / 2) * SPACING[a] for a in range(3)]
-        np.testing.assert_allclose([float(found[f'{a} [mm]']) for a in 'xyz'], place, atol=0.051)
+        np.testing.assert_allclose([float(shown[f'{a} [mm]']) for a in 'xyz'], place, atol=0.051)
 
 
 def test_keys_and_wheel_change_the_slice(page):
@@ -173,9 +173,9 @@ def test_a_pixel_of_the_slice_is_the_voxel_below_the_pointer(page, data):
         x, y = box['x'] + box['width'] * (i + 0.5) / SHAPE[0], box['y'] + box['height'] * (1 - (j + 0.5) / SHAPE[1])
         page.mouse.move(x, y)
         settled(page)
-        found = readout(page, 'pointer')
-        assert found['voxel'] == f'{i}, {j}, {z}'
-        assert abs(float(found['Truth']) - data.truth[i, j, z]) < 1e-5
+        shown = readout(page, 'pointer')
+        assert shown['voxel'] == f'{i}, {j}, {z}'
+        assert abs(float(shown['Truth']) - data.truth[i, j, z]) < 1e-5
         grey = page.evaluate(
             """([x, y]) => {
               const c = document.querySelector('[data-axis="2"]');
@@ -225,8 +225,8 @@ def test_the_map_of_errors_is_a_layer_of_its_own_scale(chromium, tmp_path):
     with opened(chromium, write_report(tmp_path, content(error_map=wrong)).as_uri()) as page:
         press(page, '5')
         assert page.locator('#slices button[aria-pressed=true]').first.text_content() == '5 Error map'
-        found, index = readout(page), at(page)
-        assert abs(float(found['Error map']) - wrong[index]) < 1e-3 / 255
+        shown, index = readout(page), at(page)
+        assert abs(float(shown['Error map']) - wrong[index]) < 1e-3 / 255
         assert float(page.locator('#slices .scales b').all_text_contents()[-1]) == pytest.approx(wrong.max(), rel=0.01)
         colours = page.evaluate(
             """() => { const c = document.querySelector('[data-axis="2"]');
@@ -265,9 +265,9 @@ def test_views_are_sorted_and_their_values_those_given(page, data):
     box = page.locator('#views canvas').first.bounding_box()
     page.mouse.move(box['x'] + box['width'] * 4.5 / 18, box['y'] + box['height'] * 2.5 / 12)
     settled(page)
-    said = page.locator('#views p[aria-live]').text_content()
-    assert 'u = -18.0 mm, v = -14.0 mm' in said
-    values = [float(part.split()[-1]) for part in said.partition('mm:')[2].split(',')]
+    text = page.locator('#views p[aria-live]').text_content()
+    assert 'u = -18.0 mm, v = -14.0 mm' in text
+    values = [float(part.split()[-1]) for part in text.partition('mm:')[2].split(',')]
     rendered, measured = data.views[3, 2, 4], data.views_truth[3, 2, 4]  # the view at 20 degrees
     np.testing.assert_allclose(values, [rendered, measured, rendered - measured], atol=2e-4)
 
@@ -340,8 +340,8 @@ def test_contrast(chromium, address, dark):
     with opened(chromium, address, dark=dark) as page:
         assert page.evaluate('document.documentElement.dataset.theme') == ('dark' if dark else 'light')
         press(page, 'c', '?')
-        found = page.evaluate(CONTRAST)
-        assert found['low'] == [] and found['looked'] > 80
+        contrasts = page.evaluate(CONTRAST)
+        assert contrasts['low'] == [] and contrasts['looked'] > 80
         page.click('#theme')
         settled(page)
         assert page.evaluate(CONTRAST)['low'] == []
@@ -379,8 +379,8 @@ def test_a_profile_follows_the_crosshair(page, data):
     x, *lines = chart.evaluate('(chart) => chart.plot.data.map((row) => [...row])')
     places = CENTRE[0] + (np.arange(SHAPE[0]) + 0.5 - SHAPE[0] / 2) * SPACING[0]
     np.testing.assert_allclose(x, places)
-    for found, volume in zip(lines, (data.volume, data.truth)):
-        np.testing.assert_allclose(found, volume[:, y, z], atol=1e-4)
+    for line, volume in zip(lines, (data.volume, data.truth)):
+        np.testing.assert_allclose(line, volume[:, y, z], atol=1e-4)
 
 
 def test_a_region_has_the_statistics_of_its_voxels(page, data):
@@ -392,8 +392,8 @@ def test_a_region_has_the_statistics_of_its_voxels(page, data):
     voxels = data.volume[first[0] : last[0] + 1, first[1] : last[1] + 1, first[2]]
     assert voxels.shape == (3, 2)
     row = page.locator('tr[data-layer=Reconstruction] td')
-    found = [float(cell.text_content()) for cell in row.all()]
-    np.testing.assert_allclose(found, [voxels.mean(), voxels.std(), voxels.min(), voxels.max()], atol=2e-5)
+    values = [float(cell.text_content()) for cell in row.all()]
+    np.testing.assert_allclose(values, [voxels.mean(), voxels.std(), voxels.min(), voxels.max()], atol=2e-5)
     assert '3.0 × 3.0 mm, 3 × 2 voxels' in page.locator('#slices .note', has_text='Region').text_content()
 
 
@@ -415,10 +415,10 @@ def test_a_line_is_drawn_and_the_histogram_counts_all_voxels(page, data):
 
 
 def test_psnr_of_each_view_is_in_the_order_of_the_angles(page, data):
-    found = page.locator('#views .chart').first.evaluate('(chart) => [...chart.plot.data[1]]')
+    plotted = page.locator('#views .chart').first.evaluate('(chart) => [...chart.plot.data[1]]')
     order = np.argsort(data.views_angles)
     errors = np.square(data.views - data.views_truth).mean((1, 2))[order]
-    np.testing.assert_allclose(found, 10 * np.log10(data.views_truth.max() ** 2 / errors))
+    np.testing.assert_allclose(plotted, 10 * np.log10(data.views_truth.max() ** 2 / errors))
 
 
 def test_the_differences_of_views_have_a_scale_of_their_own(page):

@@ -69,10 +69,10 @@ def plain(tmp_path_factory):
 @pytest.mark.parametrize('markup', MARKUP)
 def test_markup_is_text(tmp_path, plain, markup):
     """The page has the tags, the active attributes and the scripts of one without markup."""
-    found = read(page(tmp_path, markup))
-    assert found.tags == plain.tags and found.active == plain.active == [('href', '#main')]
-    assert len(found.scripts) == len(plain.scripts) and found.scripts[-1] == plain.scripts[-1]
-    assert found.text.count(markup.replace('\udcff', '\\udcff')) >= 7  # title, heading, command, and the settings
+    document = read(page(tmp_path, markup))
+    assert document.tags == plain.tags and document.active == plain.active == [('href', '#main')]
+    assert len(document.scripts) == len(plain.scripts) and document.scripts[-1] == plain.scripts[-1]
+    assert document.text.count(markup.replace('\udcff', '\\udcff')) >= 7  # title, heading, command, and the settings
 
 
 def dom(path, home):
@@ -100,6 +100,6 @@ def test_no_script_runs_in_a_browser(tmp_path):
     control.write_text(f'<!doctype html><html><body><script>{RUN}</script></body></html>')
     assert 'data-ran' in dom(control, tmp_path / 'home').partition('>')[2].partition('>')[0]
     for markup in MARKUP:
-        found = dom(page(tmp_path, markup), tmp_path / 'home')
-        root = found.partition('<head>')[0]
-        assert 'data-ran' not in root and 'data-ready' in root and '<h1>' in found and '<iframe' not in found
+        document = dom(page(tmp_path, markup), tmp_path / 'home')
+        root = document.partition('<head>')[0]
+        assert 'data-ran' not in root and 'data-ready' in root and '<h1>' in document and '<iframe' not in document

@@ -69,8 +69,8 @@ def cells(page, name):
 
 
 def test_places_in_views_are_mm(result, tmp_path):
-    known = [load_result(result(tmp_path / name, i, parameters=100 * i + 5)) for i, name in enumerate('ab')]
-    page = compare_page(known)
+    results = [load_result(result(tmp_path / name, i, parameters=100 * i + 5)) for i, name in enumerate('ab')]
+    page = compare_page(results)
     assert '"pixel":[0.5,2.0]' in page and '"unit":"mm"' in page and '★ 105' not in page and '★ 5' not in page
 
 
@@ -116,12 +116,12 @@ def test_in_a_browser(pair, tmp_path):
     code, out, err = run(COMPARE, *pair, '--truth', tmp_path / 't.nii.gz', '--out', tmp_path / 'c.html', variant=False)
     assert code == 0 and out.strip() == str(tmp_path / 'c.html'), err
     with browser() as chromium, opened(chromium, (tmp_path / 'c.html').as_uri()) as page:
-        found = readout(page)
-        index = tuple(map(int, found['voxel'].split(', ')))
+        shown = readout(page)
+        index = tuple(map(int, shown['voxel'].split(', ')))
         for path in pair:
             value = load_result(path)[1].volume()[index]
-            assert abs(float(found[path.name]) - value) < 1e-4
-            assert abs(float(found[f'Difference: {path.name} − Truth']) - (value - truth[index])) < 1e-4
+            assert abs(float(shown[path.name]) - value) < 1e-4
+            assert abs(float(shown[f'Difference: {path.name} − Truth']) - (value - truth[index])) < 1e-4
         page.keyboard.press('s')
         assert page.locator('#slices canvas.picture').count() == 3 * 7
         captions = page.locator('#views figcaption').all_text_contents()

@@ -149,31 +149,33 @@ def test_ctrl_c_passes(data):
 
 
 def test_steps_are_told_once_a_second_and_with_what_was_measured():
-    told = []
+    entries = []
 
     class Told(Failing):
         def step(self, entry, total):
-            told.append(entry)
+            entries.append(entry)
 
     watch = Watch([Told('')], 1000)
     for i in range(1, 1001):
         if i == 500:
             watch._new = dict(psnr_2d=30.0)
         watch.step(i, lambda: 0.5, 3)
-    assert [e['iteration'] for e in told] == [500, 1000] and told[0]['psnr_2d'] == 30 and 'psnr_2d' not in told[1]
+    assert (
+        [e['iteration'] for e in entries] == [500, 1000] and entries[0]['psnr_2d'] == 30 and 'psnr_2d' not in entries[1]
+    )
 
 
 def test_a_fit_that_stops_early(live):
     """First its search, then the steps until where it stops; `gaussians` is None for a neural field."""
     watch = Watch([live], 1000)
-    told = lambda **fields: watch.step(loss=lambda: 0.5, gaussians=None, **fields)  # noqa: E731
+    step = lambda **fields: watch.step(loss=lambda: 0.5, gaussians=None, **fields)  # noqa: E731
     watch._reported = -1.0
-    told(iteration=10, held_out=0.25)
+    step(iteration=10, held_out=0.25)
     assert asked(live)['line'].startswith('Search for the step to stop at: step 10, error of the views held out 0.25.')
     watch._reported = -1.0
-    told(iteration=100, stops_at=400)
+    step(iteration=100, stops_at=400)
     assert asked(live)['line'].startswith('Step 100 of 400, loss 0.5, ')
-    told(iteration=400, stops_at=400)
+    step(iteration=400, stops_at=400)
     assert 'Step 400 of 400' in asked(live)['line'] and watch.watchers == [live]
 
 
@@ -276,9 +278,9 @@ def test_a_history_that_is_thinned_is_told_as_a_whole(live, monkeypatch):
     place = asked(live)['history']['place']
     for i in range(9, 15):
         live.step(entry(i, **(dict(psnr_2d=30.0) if i == 9 else {})), 100)
-    told = asked(live, 0, place)['history']
-    iterations = [e['iteration'] for e in told['entries']]
-    assert told['whole'] and iterations == sorted(set(iterations)) and 9 in iterations and iterations[-1] == 14
+    history = asked(live, 0, place)['history']
+    iterations = [e['iteration'] for e in history['entries']]
+    assert history['whole'] and iterations == sorted(set(iterations)) and 9 in iterations and iterations[-1] == 14
     assert len(iterations) <= 10
     for bad in ('x', '1', '1.x', '.', '1.-1', '9.99999999999999', '%00'):
         assert asked(live, 0, bad)['history']['whole'], bad
@@ -303,8 +305,8 @@ def test_looking_takes_its_share_and_no_more(live, data, monkeypatch):
 
 @pytest.fixture(scope='module')
 def chromium():
-    with browser() as found:
-        yield found
+    with browser() as started:
+        yield started
 
 
 def wait_for_quiet(page):
@@ -320,11 +322,11 @@ def test_a_part_that_fails_is_said_once_and_the_page_goes_on(chromium, live, dat
             live.step(entry(i), 3)
             live._show(Drawn(data, i * 0.001))
             page.locator('#live').filter(has_text=f'Step {i} of 3').wait_for()
-            while not any(f'seen={i}&' in url for url in page.asked):  # the next question
+            while not any(f'seen={i}&' in url for url in page.addresses):  # the next question
                 page.wait_for_timeout(100)
         wait_for_quiet(page)
-        assert [said.split(':')[0] for said in page.said] == ['space could not be shown']
-        page.said.clear()
+        assert [message.split(':')[0] for message in page.messages] == ['space could not be shown']
+        page.messages.clear()
         assert page.locator('#curves .chart').count() == 2
         value = data.volume[tuple(int(n) for n in readout(page)['voxel'].split(', '))] + 0.003
         assert abs(float(readout(page)['Reconstruction']) - value) < 1e-4 * value
@@ -341,14 +343,14 @@ def test_a_fit_that_does_not_answer(chromium, data):
         page.locator('#live').filter(has_text='The fit does not answer any more').wait_for()
         # The second, where Chromium had opened a connection ahead.
         gone = r'Failed to load resource: net::ERR_(CONNECTION_\w+|SOCKET_NOT_CONNECTED)'
-        assert all(re.fullmatch(gone, said) for said in page.said) and len(page.said) == 5, page.said
-        page.said.clear()
+        assert all(re.fullmatch(gone, message) for message in page.messages) and len(page.messages) == 5, page.messages
+        page.messages.clear()
 
 
 @pytest.mark.thorough
 def test_the_page_follows_a_real_fit(chromium, data, monkeypatch):
     """Its last values are those of the volume that the fit gives. Once it has something to show, the fit waits for the page."""
-    pages, said, results = queue.Queue(), threading.Event(), []
+    pages, go_on, results = queue.Queue(), threading.Event(), []
     monkeypatch.setattr(Live, 'announce', lambda page: pages.put(page))
     step = Live.step
 
@@ -356,9 +358,9 @@ def test_the_page_follows_a_real_fit(chromium, data, monkeypatch):
         step(page, entry, total)
         while (
             page._waiting is not None or page._number
-        ) and not said.is_set():  # before the first look there is nothing
+        ) and not go_on.is_set():  # before the first look there is nothing
             page._show_if_due()
-            said.wait(0.05)
+            go_on.wait(0.05)
 
     monkeypatch.setattr(Live, 'step', waiting)
     variant = mi.variant()
@@ -375,13 +377,13 @@ def test_the_page_follows_a_real_fit(chromium, data, monkeypatch):
         page.wait_for_selector('#slices canvas.picture')
         first = page.locator('#live').text_content()
         assert re.match(r'Step \d+ of 60, loss \S+, [\d,]+ Gaussians, .*left\.', first), first
-        said.set()
+        go_on.set()
         page.locator('#live').filter(has_text='The fit is finished.').wait_for()
         wait_for_quiet(page)
         assert page.locator('#curves').is_visible() and page.locator('#space').is_visible()
-        assert all(url.startswith(address.split('?')[0]) for url in page.asked)
-        found = readout(page)
+        assert all(url.startswith(address.split('?')[0]) for url in page.addresses)
+        shown = readout(page)
     thread.join(60)
     volume = results[0].volume()
-    value = volume[tuple(int(n) for n in found['voxel'].split(', '))]
-    assert abs(float(found['Reconstruction']) - value) < 1e-4 * volume.max() and value > 0.01
+    value = volume[tuple(int(n) for n in shown['voxel'].split(', '))]
+    assert abs(float(shown['Reconstruction']) - value) < 1e-4 * volume.max() and value > 0.01

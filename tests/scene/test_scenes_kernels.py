@@ -21,9 +21,9 @@ SMALL = dict(pixels='64', pixel_size='8', size='32')
 @pytest.mark.parametrize('path', SCENES, ids=lambda path: path.stem)
 def test_shipped_scenes_launch_the_projectors_alone(path):
     """`mi.render` of a view launches what a direct call of the projectors does, in its order."""
-    known = defaults(path)
+    parameters = defaults(path)
     try:
-        loaded = load_scene(path, {k: v for k, v in SMALL.items() if k in known})
+        loaded = load_scene(path, {k: v for k, v in SMALL.items() if k in parameters})
     except InputError as error:
         if 'LINGO_MI_DATA' not in str(error):
             raise

@@ -76,8 +76,8 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
 def test_the_content_is_on_the_disk_before_the_name(tmp_path, monkeypatch):
     done = []
     for name in ('fsync', 'replace'):
-        own = getattr(os, name)
-        monkeypatch.setattr(os, name, lambda *a, own=own, name=name: done.append(name) or own(*a))
+        call = getattr(os, name)
+        monkeypatch.setattr(os, name, lambda *a, call=call, name=name: done.append(name) or call(*a))
     write_text(tmp_path / 'a', 'x')
     assert done == ['fsync', 'replace', 'fsync']
 

@@ -34,10 +34,10 @@ def test_the_table(bench, tmp_path):
 def test_packages_that_are_missing_are_left_out(bench, monkeypatch):
     for module in 'itk', 'diffct':
         monkeypatch.setitem(sys.modules, module, None)
-    said = bench('--size', 12, '--only', 'RTK, Joseph', 'diffct, PyTorch')
-    assert said == 'RTK, Joseph: not installed, left out\ndiffct, PyTorch: not installed, left out\n'
+    text = bench('--size', 12, '--only', 'RTK, Joseph', 'diffct, PyTorch')
+    assert text == 'RTK, Joseph: not installed, left out\ndiffct, PyTorch: not installed, left out\n'
 
 
 def test_overhead(bench):
-    said = bench('--overhead', '--repeats', 1)
-    assert said.splitlines()[0].startswith('bare kernel') and 'Dr.Jit' in said
+    text = bench('--overhead', '--repeats', 1)
+    assert text.splitlines()[0].startswith('bare kernel') and 'Dr.Jit' in text

@@ -19,10 +19,10 @@ def checkpoint(folder, method, **settings):
 
 def test_parts_of_a_step(tmp_path):
     """The parts make a whole, and each that computes takes time."""
-    found = measured(lm.load_fit(checkpoint(tmp_path, 'fast', n_points=200, iterations=20)), 3)
-    whole, densification = found.pop('a step'), found.pop('densification')
-    assert abs(sum(found.values()) - whole) < 1e-9 and densification >= 0
-    assert min(found['integrator, forward'], found['Adam'], whole) > 0
+    parts = measured(lm.load_fit(checkpoint(tmp_path, 'fast', n_points=200, iterations=20)), 3)
+    whole, densification = parts.pop('a step'), parts.pop('densification')
+    assert abs(sum(parts.values()) - whole) < 1e-9 and densification >= 0
+    assert min(parts['integrator, forward'], parts['Adam'], whole) > 0
     assert 'A step takes 2.00 times' in described(
         {'integrator, forward': 0.004, 'integrator, backward': 0.006, 'a step': 0.02}
     )
@@ -32,8 +32,8 @@ def test_parts_of_a_step(tmp_path):
 def test_a_loss_of_one_part(tmp_path):
     """It cannot be left out: a step would compare nothing."""
     alone = dict(lambda_l1=0, lambda_ssim=0, lambda_gradient=1, lambda_tv=0)
-    found = measured(lm.load_fit(checkpoint(tmp_path, 'fast', n_points=200, iterations=4, **alone)), 1)
-    assert set(found) == {'integrator, forward', 'integrator, backward', 'Adam', 'the rest', 'a step', 'densification'}
+    parts = measured(lm.load_fit(checkpoint(tmp_path, 'fast', n_points=200, iterations=4, **alone)), 1)
+    assert set(parts) == {'integrator, forward', 'integrator, backward', 'Adam', 'the rest', 'a step', 'densification'}
 
 
 def test_another_kind_of_fit(tmp_path):

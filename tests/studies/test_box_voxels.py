@@ -15,10 +15,10 @@ def test_rays_through_one_voxel():
     volume[2, 2, 2] = 1
     geometry = lm.Geometry.parallel(nDetector=(1, 40), dDetector=0.1, nVoxel=5, dVoxel=1.0, angles=[0.0])
     data = lm.simulate(volume, geometry, progress=False)
-    found = with_boxes(data, 8).train.projections[0, 0]
+    projections = with_boxes(data, 8).train.projections[0, 0]
     u = np.abs(np.arange(40) - 19.5) * 0.1  # distance from the middle of the voxel, mm
-    np.testing.assert_allclose(found[u < 0.43], 1, atol=1e-5)
-    np.testing.assert_allclose(found[u > 0.57], 0, atol=1e-5)
+    np.testing.assert_allclose(projections[u < 0.43], 1, atol=1e-5)
+    np.testing.assert_allclose(projections[u > 0.57], 0, atol=1e-5)
     assert data.train.projections[0, 0][u > 0.57].max() > 0.3  # the trilinear interpolant reaches into the neighbours
     assert with_boxes(data, 8).train.geometry.grid.shape == (5, 5, 5)
 

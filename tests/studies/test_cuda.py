@@ -74,15 +74,15 @@ def test_counts_of_a_profile():
     """Instructions of warps are a block's times the warps that ran it; moves are left out."""
     blocks = [dict(warps=10, lanes=200, fp32=3, move=7), dict(warps=2, lanes=64, atomic=1)]
     accesses = [dict(kind='a', sectors=5), dict(kind='l', sectors=7), dict(kind='l', sectors=1)]
-    found = _counts(dict(launches=2, threads=64, blocks=blocks, accesses=accesses))
-    assert found['warp']['fp32'] == 30 and found['warp']['atomic'] == 2 and sum(found['warp'].values()) == 32
-    assert found['lanes'] == 3 * 200 + 64 and (found['loads'], found['stores'], found['atomics']) == (8, 0, 5)
+    totals = _counts(dict(launches=2, threads=64, blocks=blocks, accesses=accesses))
+    assert totals['warp']['fp32'] == 30 and totals['warp']['atomic'] == 2 and sum(totals['warp'].values()) == 32
+    assert totals['lanes'] == 3 * 200 + 64 and (totals['loads'], totals['stores'], totals['atomics']) == (8, 0, 5)
 
 
 def test_difference_of_counts():
     more, less = dict(a=kernel(3, fp32=9), b=kernel(1), c=kernel(2, int=4)), dict(a=kernel(1, fp32=2), b=kernel(1))
-    found = difference(more, less)
-    assert set(found) == {'a', 'c'} and found['a']['launches'] == 2 and found['a']['warp']['fp32'] == 7
+    actual = difference(more, less)
+    assert set(actual) == {'a', 'c'} and actual['a']['launches'] == 2 and actual['a']['warp']['fp32'] == 7
 
 
 # ---- the model -------------------------------------------------------------------------------------------------------
@@ -123,19 +123,21 @@ def test_steps_that_do_not_end(monkeypatch):
 def test_times_of_a_kernel():
     """By hand: 64 multiprocessors at 1 GHz, 100 GB/s, lanes of an A100."""
     card = Card('a card', 64, 1e9, 100e9, 80)
-    found = times(kernel(fp32=64_000_000, fp64=1_000_000, atomics=47_360_000, loads=3_125_000), card)
-    assert found['fp32'] == pytest.approx(64e6 * 32 / (64 * 64e9))
-    assert found['issue'] == pytest.approx(65e6 / (4 * 64e9)) and found['fp64'] == pytest.approx(32e6 / (32 * 64e9))
-    assert found['atomics'] == pytest.approx(1e-3) and found['memory'] == pytest.approx(1e-3)
+    times_found = times(kernel(fp32=64_000_000, fp64=1_000_000, atomics=47_360_000, loads=3_125_000), card)
+    assert times_found['fp32'] == pytest.approx(64e6 * 32 / (64 * 64e9))
+    assert times_found['issue'] == pytest.approx(65e6 / (4 * 64e9)) and times_found['fp64'] == pytest.approx(
+        32e6 / (32 * 64e9)
+    )
+    assert times_found['atomics'] == pytest.approx(1e-3) and times_found['memory'] == pytest.approx(1e-3)
     assert seconds(kernel(launches=7), card) == pytest.approx(7 * model.LAUNCH)
 
 
 def test_times_of_a_fit():
     scan = tiny_scan(geometry())
-    found = measure.measured(run_fit(scan, SHORT), repeats=2)
-    for work in found.values():
+    measured = measure.measured(run_fit(scan, SHORT), repeats=2)
+    for work in measured.values():
         assert work['launches'] > 10 and 0 < work['short'] <= work['launches'] and 0 < work['of_short'] <= work['all']
-    assert found['a step']['seconds'] > 0
+    assert measured['a step']['seconds'] > 0
 
 
 def test_times_by_the_model(monkeypatch):
@@ -144,9 +146,9 @@ def test_times_by_the_model(monkeypatch):
         measure, 'gpu', lambda: GPU(card.name, 0, card.multiprocessors, 64, 90, card.clock, card.bandwidth)
     )
     foot = counts()['foot']
-    found = measure.expected(foot['gaussians'])
-    assert found['a step'] == pytest.approx(1e3 * sum(seconds(kernel, card) for kernel in foot['step']))
-    assert found['image and derivatives'] < found['a step']
+    expected = measure.expected(foot['gaussians'])
+    assert expected['a step'] == pytest.approx(1e3 * sum(seconds(kernel, card) for kernel in foot['step']))
+    assert expected['image and derivatives'] < expected['a step']
     monkeypatch.setattr(measure, 'gpu', lambda: GPU('unknown', 0, 1, 64, 90, 0, 0))
     assert measure.expected(1000) == {}
 
@@ -159,12 +161,12 @@ def test_consumer_cards_take_longer_for_float64():
 
 def test_predictions():
     """More Gaussians and pairs take more time; the kept counts are complete."""
-    found = counts()
-    assert set(found) == {'foot', 'chest', 'giants'}
-    for name, parts in found.items():
+    predictions = counts()
+    assert set(predictions) == {'foot', 'chest', 'giants'}
+    for name, parts in predictions.items():
         assert parts['gaussians'] > 0 and parts['boxes'] >= parts['pairs'] > 0
         assert largest(parts['image'])['atomics'] > 0 and ('step' in parts) == (name != 'giants')
-    foot = found['foot']
+    foot = predictions['foot']
     for part in ('image', 'derivatives', 'step'):
         usual = predicted(part, CARDS[0], foot['gaussians'], foot['boxes'])
         assert usual == pytest.approx(sum(seconds(k, CARDS[0]) for k in foot[part]))
@@ -195,9 +197,9 @@ def test_tables_of_the_document(tmp_path, monkeypatch):
 def test_page():
     outcomes = {'sm_80': Outcome(5, ['test_a.py: test_b'], Counter({'no OptiX': 2}))}
     spills = Kernel('drjit_0123456789abcdef', 'test_a.py', 80, 99, 200, 16)
-    own = Kernel('gemm_f32_64_tn', 'test_a.py', 80, 99, 128, 16)
-    assert spills.fails and not own.fails
-    text = page(outcomes, [spills, own, Kernel('drjit_f', 'test_a.py', 80, 9, error='why')])
+    dr_jit_kernel = Kernel('gemm_f32_64_tn', 'test_a.py', 80, 99, 128, 16)
+    assert spills.fails and not dr_jit_kernel.fails
+    text = page(outcomes, [spills, dr_jit_kernel, Kernel('drjit_f', 'test_a.py', 80, 9, error='why')])
     assert '| sm_80 | 5 | 2 | 1 |' in text and '| no OptiX | 2 |' in text and '- sm_80: test_a.py: test_b' in text
     assert "| sm_80, Dr.Jit's own matrix products | 1 | 128 | 128 | 0 | 1 | 0 |" in text
     assert (

@@ -22,9 +22,9 @@ def test_every_experiment_has_its_scene():
 
 def test_a_wrong_scale_alone_costs_nothing_after_the_gain():
     truth = np.random.default_rng(0).random((4, 5, 6))
-    found = quality(0.9 * truth, truth)
-    assert found['psnr_3d_gain'] > 200
-    np.testing.assert_allclose(found['psnr_3d'], 10 * np.log10(truth.max() ** 2 / (0.01 * (truth**2).mean())))
+    actual = quality(0.9 * truth, truth)
+    assert actual['psnr_3d_gain'] > 200
+    np.testing.assert_allclose(actual['psnr_3d'], 10 * np.log10(truth.max() ** 2 / (0.01 * (truth**2).mean())))
 
 
 @pytest.mark.thorough
@@ -38,8 +38,8 @@ def test_an_experiment(tmp_path, monkeypatch):
     document.write_text('<!-- table worth -->\n<!-- end worth -->\n')
     write({'psf': result}, out, tmp_path / 'figures', document)
     assert f'{result["model"]["psnr_3d"]:.2f}' in document.read_text()
-    found = json.loads((out / 'effects.json').read_text())['psf']
-    assert found['ignore']['psnr_3d'] == result['ignore']['psnr_3d'] and found['provenance']['date']
+    record = json.loads((out / 'effects.json').read_text())['psf']
+    assert record['ignore']['psnr_3d'] == result['ignore']['psnr_3d'] and record['provenance']['date']
     assert (out / 'effects.md').read_text().count('|') == document.read_text().count('|')
     assert all((folder / 'effects.provenance.json').exists() for folder in (out, tmp_path))
     assert (tmp_path / 'figures' / 'psf.png').stat().st_size > 10_000

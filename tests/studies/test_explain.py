@@ -29,11 +29,11 @@ def fan(views=60):
 def test_a_drift_is_what_explains_it(tmp_path):
     dataset = fan()
     calibration = lm.calibrate(dataset, drift=3, progress=False)
-    found = list(explain.rows(dataset, calibration, tmp_path, progress=lambda name: None))
-    assert [row.name for row in found] == ['as given', 'axis and turn of the panel', 'drift', explain.NOTHING]
-    assert found[1].rms < found[0].rms and found[2].rms < 0.6 * found[1].rms
-    text = explain.report(found, tmp_path, 'corrected')
-    assert text.count('\n') >= 5 and json.loads((tmp_path / 'rms.json').read_text())['drift'] == found[2].rms
+    table = list(explain.rows(dataset, calibration, tmp_path, progress=lambda name: None))
+    assert [row.name for row in table] == ['as given', 'axis and turn of the panel', 'drift', explain.NOTHING]
+    assert table[1].rms < table[0].rms and table[2].rms < 0.6 * table[1].rms
+    text = explain.report(table, tmp_path, 'corrected')
+    assert text.count('\n') >= 5 and json.loads((tmp_path / 'rms.json').read_text())['drift'] == table[2].rms
     assert (tmp_path / 'residuals.png').stat().st_size > 1000 and (tmp_path / 'rms.provenance.json').exists()
 
 
@@ -43,11 +43,11 @@ def test_air_that_is_read_beside_the_object_is_a_row(tmp_path):
     dataset = lm.Dataset(*(lm.Scan(s.geometry, s.projections + air) for s in (sound.train, sound.test)))
     calibration = lm.calibrate(dataset, progress=False)
     assert calibration.air is not None
-    found = {row.name: row.rms for row in explain.rows(dataset, calibration, tmp_path, progress=lambda name: None)}
-    assert list(found) == ['as given', 'axis and turn of the panel', explain.AIR, explain.NOTHING]
-    assert found[explain.AIR] < 0.8 * found['axis and turn of the panel']
+    rms = {row.name: row.rms for row in explain.rows(dataset, calibration, tmp_path, progress=lambda name: None)}
+    assert list(rms) == ['as given', 'axis and turn of the panel', explain.AIR, explain.NOTHING]
+    assert rms[explain.AIR] < 0.8 * rms['axis and turn of the panel']
     quiet = {r.name: r.rms for r in explain.rows(sound, replace(calibration, air=None), tmp_path, lambda name: None)}
-    assert found[explain.AIR] == pytest.approx(quiet['axis and turn of the panel'], rel=0.02)
+    assert rms[explain.AIR] == pytest.approx(quiet['axis and turn of the panel'], rel=0.02)
 
 
 @pytest.mark.thorough
@@ -75,5 +75,5 @@ def test_stored_rows_are_those_of_their_scan_and_numbers(tmp_path, monkeypatch):
     assert rows(lm.Dataset(turned, dataset.test)) and computed[0] == 'as given'
     monkeypatch.setattr(explain, 'WITH_CLOUD', {'as given': {}})
     list(explain.cloud_rows(dataset, tmp_path, progress=lambda name: None, iterations=2, n_points=50))
-    kept = {path.parent.name for path in tmp_path.rglob('as_given.json')}
-    assert kept == {'corrected', 'with_the_cloud'}  # both have a row of this name
+    folders = {path.parent.name for path in tmp_path.rglob('as_given.json')}
+    assert folders == {'corrected', 'with_the_cloud'}  # both have a row of this name

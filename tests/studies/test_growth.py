@@ -46,19 +46,19 @@ def test_the_command(tmp_path, monkeypatch):
     monkeypatch.setattr(sweep, 'BASE', stages.Size(16, 16, 4, 100))
     code, text, err = run_growth(tmp_path)
     assert code == 0, err
-    found = json.loads((tmp_path / 'growth.json').read_text())
-    assert [(r['axis'], r['number']) for r in found] == [('voxels', 512), ('voxels', 4096), ('voxels', 13824)] + [
+    record = json.loads((tmp_path / 'growth.json').read_text())
+    assert [(r['axis'], r['number']) for r in record] == [('voxels', 512), ('voxels', 4096), ('voxels', 13824)] + [
         ('views', 2),
         ('views', 4),
     ]
-    assert all(row['seconds'] > 0 for row in found) and (tmp_path / 'growth.md').read_text() in text
+    assert all(row['seconds'] > 0 for row in record) and (tmp_path / 'growth.md').read_text() in text
     assert (tmp_path / 'growth.png').stat().st_size > 10_000 and (tmp_path / 'growth.provenance.json').exists()
     # What is stored is not measured again, and a stage that fails does not lose it.
     monkeypatch.setattr(sweep, 'DEPENDS', {'FDK': ('voxels', 'views'), 'voxelise': ('views',)})
     monkeypatch.setattr(sweep, '_measured', mock.Mock(side_effect=InputError('voxelise: no')))
     code, _, err = run_growth(tmp_path)
     assert code == 2 and err.splitlines()[-1] == 'error: voxelise: no' and sweep._measured.call_count == 1
-    assert json.loads((tmp_path / 'growth.json').read_text()) == found
+    assert json.loads((tmp_path / 'growth.json').read_text()) == record
     (tmp_path / 'growth.json').write_text('{"mine": 1}')
     code, _, err = run_growth(tmp_path)
     assert code == 2 and 'growth.json: holds no measurements' in err and err.count('\n') == 1

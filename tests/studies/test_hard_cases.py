@@ -151,9 +151,9 @@ def test_what_is_no_file_of_results(tmp_path, text):
 
 def test_committed_results_miss_nothing():
     """All cases are there, and none misses its tolerance."""
-    found = stored(FIT.parents[1] / 'docs' / 'tables' / 'hard_cases.cuda.json')
-    assert found.variant == 'cuda_ad_mono' and {case.name for case in CASES} <= set(found.results)
-    assert not found.misses(CASES)
+    results = stored(FIT.parents[1] / 'docs' / 'tables' / 'hard_cases.cuda.json')
+    assert results.variant == 'cuda_ad_mono' and {case.name for case in CASES} <= set(results.results)
+    assert not results.misses(CASES)
 
 
 def test_command(tmp_path, monkeypatch):
@@ -235,8 +235,8 @@ def test_a_pile_of_gaussians_is_summed_as_accurately_as_one(side, sigma):
 def test_a_pile_of_gaussians_in_voxels():
     count, grid = 20_000, Lattice(vector64([-1, -1, -1]), vector64([0.1] * 3), (20, 20, 20))
     one = Cloud([[0.03, 0.02, -0.01]], [[0.03, 0.05, 0.04]], [[0.1, 0.2, 0.3, 0.9]], [0.7])
-    found, expected = (voxelize(*on_device(one[np.zeros(n, int)]), grid, 4.0, deep=True).numpy() for n in (count, 1))
-    assert relative(found, count * expected.astype(float)) < 3e-6
+    actual, expected = (voxelize(*on_device(one[np.zeros(n, int)]), grid, 4.0, deep=True).numpy() for n in (count, 1))
+    assert relative(actual, count * expected.astype(float)) < 3e-6
 
 
 # ------------------------------------------------------------------------------------------------------------
@@ -448,8 +448,8 @@ def test_otsu_of_flat_images(value):
     image = np.full((6, 7), value, np.float32)
     assert otsu_of_paper(image) == image[0, 0] == otsu_on_device(mi.Float(image.ravel()))[0]
     if value >= 0:
-        found = masks(image[None])
-        assert not found.high.any()
+        masked = masks(image[None])
+        assert not masked.high.any()
 
 
 @pytest.mark.parametrize('full, expected', [(False, 0.0), (True, 1.0)])

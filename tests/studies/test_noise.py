@@ -20,8 +20,8 @@ def noise(monkeypatch, capsys, *args):
 def test_a_small_table(monkeypatch, capsys, tmp_path):
     small = dict(size=12, pixels=16, iterations=100)
     options = [word for name, value in small.items() for word in (f'--{name}', value)]
-    given = ('--objects', 'foot', '--photons', 500, '--finer', 1, '--views', 6, '--out', tmp_path, *options)
-    code, text, err = noise(monkeypatch, capsys, *given, '--variant', 'llvm_ad_mono')
+    arguments = ('--objects', 'foot', '--photons', 500, '--finer', 1, '--views', 6, '--out', tmp_path, *options)
+    code, text, err = noise(monkeypatch, capsys, *arguments, '--variant', 'llvm_ad_mono')
     assert code == 0, err
     study, case = Study(tmp_path, **small), Case('foot', 500.0, 1, 6)
     cells = {setting: study.get(case, setting) for setting in SETTINGS}
@@ -32,7 +32,7 @@ def test_a_small_table(monkeypatch, capsys, tmp_path):
     row = (tmp_path / 'noise.md').read_text().splitlines()[-1]
     assert row.startswith('| foot | x1 | 500 |') and row in text and '–' not in row
     study.cells.path(study.name(case), 'noise').write_text(json.dumps(cells['noise'] | dict(psnr_3d=[1.0, 2.0])))
-    code, text, err = noise(monkeypatch, capsys, *given, '--variant', 'llvm_ad_mono')
+    code, text, err = noise(monkeypatch, capsys, *arguments, '--variant', 'llvm_ad_mono')
     assert code == 0 and '2.00 (100)' in text, err
 
 

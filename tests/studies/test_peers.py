@@ -78,12 +78,12 @@ def test_numbers_and_that_they_are_kept(peers, scan, tmp_path):
     folder = tmp_path / 'out' / 'walnut_16_16_16'
     train = read_scan(scan).train
     cell = json.loads((folder / '6_views' / 'asd-pocs.json').read_text())
-    found = read_volume(folder / '6_views' / 'asd-pocs.nii.gz').data
+    volume = read_volume(folder / '6_views' / 'asd-pocs.nii.gz').data
     reference = read_volume(folder / 'reference.nii.gz').data
     geometry = train.geometry.on(Grid((16,) * 3, (2.4,) * 3, train.geometry.grid.centre))
-    wrong = grid.project_volume(found, geometry.subset(slice(1, None, 2))) - train.projections[1::2]
+    wrong = grid.project_volume(volume, geometry.subset(slice(1, None, 2))) - train.projections[1::2]
     assert cell['held_out_rms'] == pytest.approx(np.sqrt(np.mean(wrong.astype(float) ** 2)), rel=1e-5)
-    assert cell['psnr_3d'] == pytest.approx(psnr_3d(found, reference), abs=1e-4)
+    assert cell['psnr_3d'] == pytest.approx(psnr_3d(volume, reference), abs=1e-4)
     assert (folder / 'slices.png').stat().st_size > 1000
     (folder / '6_views' / 'fdk.json').write_text(json.dumps(cell | dict(method='fdk', held_out_rms=0.5)))
     code, text, err = peers(*command)
@@ -102,8 +102,8 @@ def test_a_setting_is_chosen_by_views_that_are_held_out():
         return truth * weight
 
     method = Method('scaled', volume, 'weight', (0.5, 1.0, np.nan, 2.0))
-    found, settings = method.run(Scan(geometry, grid.project_volume(truth, geometry)))
-    assert settings == {'weight': 1.0} and np.array_equal(found, truth) and views == [8, 8, 8, 8, 10]
+    chosen, settings = method.run(Scan(geometry, grid.project_volume(truth, geometry)))
+    assert settings == {'weight': 1.0} and np.array_equal(chosen, truth) and views == [8, 8, 8, 8, 10]
     assert replace(method, values=(2.0,)).run(Scan(geometry, grid.project_volume(truth, geometry)))[1] == {
         'weight': 2.0
     }
@@ -120,8 +120,8 @@ def test_missing_peers_are_left_out(peers):
 @pytest.mark.thorough
 @pytest.mark.parametrize('method, module', [('rtk-tv', 'itk'), ('mbirjax', 'mbirjax'), ('mbirjax:1', 'mbirjax')])
 def test_peers(peers, tmp_path, method, module):
-    found = pytest.importorskip(module, reason=f"{module} is not installed: pip install -e '.[reference]'")
-    if module == 'itk' and not hasattr(found, 'RTK'):
+    module_found = pytest.importorskip(module, reason=f"{module} is not installed: pip install -e '.[reference]'")
+    if module == 'itk' and not hasattr(module_found, 'RTK'):
         pytest.skip("ITK has no RTK: pip install -e '.[reference]'")
     code, text, err = peers('--views', 6, '--methods', 'sart', method)
     assert code == 0, err
@@ -164,8 +164,8 @@ def test_pixels_that_are_not_valid(tmp_path):
     for take in lambda: rtk_bridge.reconstruct('FDK', masked, None), lambda: mbirjax_bridge.reconstruct(masked, None):
         with pytest.raises(InputError, match='pixels are all valid'):
             take()
-    said = []
+    lines = []
     study = Study(Dataset(masked, volume=volume), tmp_path / 'b')
     with pytest.warns(UserWarning, match='were filled'):
-        study.compute_missing(['fdk', 'sart'], [6], said.append)
-    assert 'fdk: rms' in said[0] and 'sart: rms' in said[1]
+        study.compute_missing(['fdk', 'sart'], [6], lines.append)
+    assert 'fdk: rms' in lines[0] and 'sart: rms' in lines[1]

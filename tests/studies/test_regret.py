@@ -47,8 +47,8 @@ def test_a_small_table(monkeypatch, capsys, tmp_path):
     assert json.loads((tmp_path / 'regret.provenance.json').read_text())['command'].startswith(
         'python -m studies.regret '
     )
-    kept = study.cells.path(study.name(case), 'refined')
-    kept.write_text(json.dumps(cells['refined'] | dict(psnr_3d=99.0)))
+    cell_file = study.cells.path(study.name(case), 'refined')
+    cell_file.write_text(json.dumps(cells['refined'] | dict(psnr_3d=99.0)))
     study.cells.path(study.name(case), BEST).write_text('{')  # cut short: computed again
     code, text, err = regret(monkeypatch, capsys, *command)
     assert code == 0 and '99.00' in text and f'{cells[BEST]["psnr_3d"]:.2f} (' in text, err
@@ -56,17 +56,17 @@ def test_a_small_table(monkeypatch, capsys, tmp_path):
 
 def test_the_measured_walnut(data, tmp_path):
     """On the voxels asked for, which are as large as all together need; its truth is the FDK of all views."""
-    found = Study(tmp_path, 8).dataset(Case('walnut', views=30))
-    geometry = found.train.geometry
-    assert tuple(geometry.grid.shape) == (8, 8, 8) and len(found.train) == 30
+    dataset = Study(tmp_path, 8).dataset(Case('walnut', views=30))
+    geometry = dataset.train.geometry
+    assert tuple(geometry.grid.shape) == (8, 8, 8) and len(dataset.train) == 30
     np.testing.assert_allclose(8 * np.array(geometry.grid.spacing), 128 * 0.305)
-    assert found.volume.shape == (8, 8, 8) and found.volume.max() > 0.01
+    assert dataset.volume.shape == (8, 8, 8) and dataset.volume.max() > 0.01
 
 
 def test_noise_is_that_of_photons():
     views = np.full((40, 40, 40), 2.0, np.float32)
-    found = noisy(views, counting(1000.0))
-    assert abs(found.std() / np.sqrt(np.exp(2.0) / 1000) - 1) < 0.05 and abs(found.mean() - 2) < 0.01
+    actual = noisy(views, counting(1000.0))
+    assert abs(actual.std() / np.sqrt(np.exp(2.0) / 1000) - 1) < 0.05 and abs(actual.mean() - 2) < 0.01
     assert np.isfinite(noisy(views + 20, counting(1000.0))).all()
 
 

@@ -144,13 +144,13 @@ def test_pixel_quadrature_converges(variant, output):
     work = Workload(60, 64, 80.0, order=4)
 
     def image(n):
-        found = render(work, extent=7.0, pixel=n, output=output)
-        return 1 - found if output == 'transmission' else found
+        errors_of = render(work, extent=7.0, pixel=n, output=output)
+        return 1 - errors_of if output == 'transmission' else errors_of
 
     expected = work.truth[0].ravel() if output == 'line_integral' else image(16)
-    found = [relative(image(n), expected) for n in ('centre', '2', 4)]
-    assert 1e-3 < found[0] < 0.1
-    for coarse, fine in zip(found, found[1:]):
+    errors_of = [relative(image(n), expected) for n in ('centre', '2', 4)]
+    assert 1e-3 < errors_of[0] < 0.1
+    for coarse, fine in zip(errors_of, errors_of[1:]):
         assert 3 < coarse / fine < 5
 
 
@@ -164,9 +164,9 @@ def test_pixel_gradients(variant):
 def test_pixel_area(variant, mode):
     """Better than 4 x 4 rays where the Gaussians are wider than a pixel, and nearly by the fourth power of its size."""
     coarse, fine = (Workload(60, 64 * k, 80.0 * k**2, order=6, mode=mode) for k in (1, 2))
-    found, rays = errors(fine, extent=8.0, pixel='area'), errors(fine, extent=8.0, pixel=4)
-    assert all(found[name] < 0.8 * rays[name] for name in found)
-    assert found['image'] < 2e-4 and errors(coarse, extent=8.0, pixel='area')['image'] / found['image'] > 8
+    actual, rays = errors(fine, extent=8.0, pixel='area'), errors(fine, extent=8.0, pixel=4)
+    assert all(actual[name] < 0.8 * rays[name] for name in actual)
+    assert actual['image'] < 2e-4 and errors(coarse, extent=8.0, pixel='area')['image'] / actual['image'] > 8
 
 
 def test_pixel_area_of_a_pixel_wide_ridge(variant):
@@ -246,8 +246,8 @@ def test_presets(cone):
         assert_same(render(cone, accuracy=name), render(cone, extent=extent))
     assert_same(render(cone), render(cone, accuracy='default'))
     assert_same(render(cone, accuracy='draft', extent=6.0), render(cone, extent=6.0))
-    found = [errors(cone, accuracy=name) for name in PRESETS]
-    for better, limits in zip(found, ((2e-2, 0.2), (1e-5, 2e-4), (1e-6, 3e-6))):
+    values = [errors(cone, accuracy=name) for name in PRESETS]
+    for better, limits in zip(values, ((2e-2, 0.2), (1e-5, 2e-4), (1e-6, 3e-6))):
         assert better['image'] < limits[0] and max(better.values()) < limits[1]
 
 
@@ -285,8 +285,8 @@ def test_every_gaussian_on_every_ray(beam, precision, limit, request):
     image, gradients = work.truth
     assert deviation(np.array(method.image()), image)[0] < (1e-12 if precision == 'float64' else limit)
     if method.gradients:
-        for name, found in zip(NAMES, method.gradients()):
-            assert relative(np.array(found).T, gradients[name]) < limit
+        for name, actual in zip(NAMES, method.gradients()):
+            assert relative(np.array(actual).T, gradients[name]) < limit
 
 
 def test_march_of_a_constant():
@@ -294,8 +294,8 @@ def test_march_of_a_constant():
     data = dr.ones(mi.Float, 8**3)
     dr.make_opaque(data)
     origin, direction = mi.Point3f([-3, -3], [0, 0], [0, 0.4]), mi.Vector3f([1, 1], [0, 0.1], [0, 0])
-    found = alternatives.march(data, 8, 1.0, origin, direction / dr.norm(direction), 0.002).numpy()
-    np.testing.assert_allclose(found, [2, 2 * np.hypot(1, 0.1)], atol=0.004)
+    actual = alternatives.march(data, 8, 1.0, origin, direction / dr.norm(direction), 0.002).numpy()
+    np.testing.assert_allclose(actual, [2, 2 * np.hypot(1, 0.1)], atol=0.004)
 
 
 @pytest.mark.traces_rays
@@ -351,21 +351,21 @@ def test_presets_are_described_as_measured(variant):
 @pytest.mark.thorough
 def test_presets_of_two_variants(tmp_path, monkeypatch):
     """The presets alone, by the command: their table with another run's errors, in place of that of the document."""
-    found = measure_presets(TINY)
-    other = json.loads(json.dumps(found))
+    actual = measure_presets(TINY)
+    other = json.loads(json.dumps(actual))
     other['conditions']['variant'] = 'cuda_ad_mono'
     other['cutoff'][0].update(image=0.123, rotation=4.56)
     there, document = tmp_path / 'there.json', tmp_path / 'accuracy.md'
     there.write_text(json.dumps(other))
     document.write_text('<!-- table presets -->\nold\n<!-- end presets -->\n')
-    monkeypatch.setattr('lingo_mi.validation.accuracy.measure_presets', lambda *_: found)
+    monkeypatch.setattr('lingo_mi.validation.accuracy.measure_presets', lambda *_: actual)
     script, out = ROOT / 'scripts' / 'accuracy.py', tmp_path / 'out'
     code, printed, err = run(script, '--presets', '--beside', there, '--out', out, '--document', document)
     assert code == 0 and 'accuracy.json' in printed, err
     head, _, draft, *rest = (line for line in document.read_text().splitlines() if line.startswith('|'))
     cells = dict(zip(head.split(' | '), draft.split(' | ')))
     assert cells['image, L2, CUDA'] == '1.2e-01' and cells['worst ∂, CUDA'] == '4.6e+00' and len(rest) == 2
-    assert read_presets(out / 'accuracy.json')['cutoff'] == found['cutoff'] and not list(tmp_path.rglob('*.png'))
+    assert read_presets(out / 'accuracy.json')['cutoff'] == actual['cutoff'] and not list(tmp_path.rglob('*.png'))
     there.write_text('{"cutoff": []}')
     code, _, err = run(script, '--presets', '--beside', there, '--out', out)
     assert code == 2 and 'holds no presets' in err
@@ -376,19 +376,19 @@ def test_presets_of_two_variants(tmp_path, monkeypatch):
 def test_whole_measurement(tmp_path, monkeypatch):
     """Every part on a tiny configuration, down to the documentation, by the function and by the command."""
     parts = []
-    found = measure(TINY, parts.append)
-    assert len(parts) == len(found) - 1
+    actual = measure(TINY, parts.append)
+    assert len(parts) == len(actual) - 1
     document = tmp_path / 'accuracy.md'
     document.write_text((ROOT / 'docs' / 'accuracy.md').read_text(encoding='utf-8'), encoding='utf-8')
-    write(found, tmp_path / 'out', tmp_path / 'figures', document)
+    write(actual, tmp_path / 'out', tmp_path / 'figures', document)
     for name in ('pareto', 'scaling', 'fits'):
         assert 5_000 < (tmp_path / 'figures' / f'{name}.png').stat().st_size < 150_000
-    tables = make_tables(found)
+    tables = make_tables(actual)
     assert list(tables) == list(TITLES)
     text = document.read_text(encoding='utf-8')
     assert all(tables[name] in text for name in SHOWN)
     assert (tmp_path / 'out' / 'accuracy.provenance.json').exists() and (tmp_path / 'accuracy.provenance.json').exists()
-    monkeypatch.setattr('lingo_mi.validation.accuracy.measure', lambda *_: found)
+    monkeypatch.setattr('lingo_mi.validation.accuracy.measure', lambda *_: actual)
     script, docs = ROOT / 'scripts' / 'accuracy.py', tmp_path / 'docs'
     docs.mkdir()
     (docs / 'accuracy.md').write_text('\n'.join(f'<!-- table {name} -->\n<!-- end {name} -->\n' for name in SHOWN))

@@ -23,14 +23,16 @@ KEYS = (
 def test_all_numbers_are_there(tmp_path):
     few = '--gaussians', 50, '--size', 32, '--pixels', 40, '--repeats', 1, '--json', tmp_path / 'a.json'
     code, out, err = run(BENCH, *few)
-    found = json.loads((tmp_path / 'a.json').read_text())
+    record = json.loads((tmp_path / 'a.json').read_text())
     assert code == 0, err
-    measured = [found[key] for key in KEYS if found[key] is not None or not key.startswith('limit')]  # no g++: no limit
+    measured = [
+        record[key] for key in KEYS if record[key] is not None or not key.startswith('limit')
+    ]  # no g++: no limit
     assert min(measured) > 0 and 'times ours' in out
-    assert found['image_error'] < 0.02 and found['gradient_error'] < 0.1
+    assert record['image_error'] < 0.02 and record['gradient_error'] < 0.1
     assert run(BENCH, *few, '--no-bvh')[0] == 0
-    found = json.loads((tmp_path / 'a.json').read_text())
-    assert [found[key] for key in KEYS if key.startswith('bvh')] == [None, None]
+    record = json.loads((tmp_path / 'a.json').read_text())
+    assert [record[key] for key in KEYS if key.startswith('bvh')] == [None, None]
 
 
 @pytest.mark.parametrize(

@@ -39,11 +39,11 @@ def test_in_a_file(tmp_path):
 @pytest.mark.parametrize('option', ['--docs', '--document'])
 def test_a_document_without_its_places_is_refused_before_measuring(name, command, option, tmp_path):
     (tmp_path / f'{name}.md').write_text('nothing')
-    given = {'--docs': tmp_path, '--document': tmp_path / f'{name}.md'}[option]
-    code, out, err = run(command, option, given, '--out', tmp_path / 'out')
+    path = {'--docs': tmp_path, '--document': tmp_path / f'{name}.md'}[option]
+    code, out, err = run(command, option, path, '--out', tmp_path / 'out')
     assert code == 2 and err.startswith('error: ') and 'no place for the table' in err and err.count('\n') == 1
     code, out, err = run(command, option, tmp_path / 'absent', '--out', tmp_path / 'out')
     assert code == 2 and err.startswith('error: ') and err.count('\n') == 1
     assert not out and not (tmp_path / 'out').exists()
-    code, out, err = run(command, option, given, '--out', tmp_path)
+    code, out, err = run(command, option, path, '--out', tmp_path)
     assert code == 2 and 'could overwrite' in err and err.count('\n') == 1

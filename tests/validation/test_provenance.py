@@ -15,11 +15,11 @@ def test_beside_a_table(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, 'argv', ['python -m studies.tables', 'views', '--out', 'a b'])
     path = provenance.write_provenance(tmp_path / 'views.md')
     assert path == tmp_path / 'views.provenance.json' and [p.name for p in tmp_path.iterdir()] == [path.name]
-    found = json.loads(path.read_text())
-    assert list(found) == ['command', 'commit', 'date', 'machine', 'versions']
-    assert found['command'] == "python -m studies.tables views --out 'a b'"
-    assert found['machine'] and found['versions']['mitsuba'].startswith('3.')
-    age = datetime.datetime.now(datetime.timezone.utc) - datetime.datetime.fromisoformat(found['date'])
+    record = json.loads(path.read_text())
+    assert list(record) == ['command', 'commit', 'date', 'machine', 'versions']
+    assert record['command'] == "python -m studies.tables views --out 'a b'"
+    assert record['machine'] and record['versions']['mitsuba'].startswith('3.')
+    age = datetime.datetime.now(datetime.timezone.utc) - datetime.datetime.fromisoformat(record['date'])
     assert abs(age.total_seconds()) < 60
 
 

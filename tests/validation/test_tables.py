@@ -113,9 +113,9 @@ def test_two_stages(out):
     )
     measured = train.subset([0, 6, 12, 18])
     refined = run_algorithm(measured, tables.Refined(), completed=whole, sample=cells._cloud(fit).volume)
-    found = refined.volume
+    actual = refined.volume
     assert rows['refined']['r2']['psnr_3d_r2'] == pytest.approx(
-        tables.metrics.psnr_3d_r2(found, truth), rel=fits_alike(1e-5)
+        tables.metrics.psnr_3d_r2(actual, truth), rel=fits_alike(1e-5)
     )
     assert (
         rows['refined']['none'] is None
@@ -125,8 +125,8 @@ def test_two_stages(out):
 
 def test_the_parts_of_lingo():
     """Each row has its parts and nothing else; the first and the last are the methods of the other tables."""
-    found = groups('ablation', [25], [20], [])
-    cells = {group.second: [column.cell('foot') for column in group.columns] for group in found}
+    grouped = groups('ablation', [25], [20], [])
+    cells = {group.second: [column.cell('foot') for column in group.columns] for group in grouped}
     assert list(cells) == list(ABLATION) and all(volume == Volume(fit, 'asd-pocs') for fit, volume in cells.values())
     assert cells['- - -'][0] == Fit('foot', 25, 'r2', 20) and cells['+ + +'][0] == Fit('foot', 25, 'lingo', 20)
     base = method_for(cells['+ + +'][0], TINY)
@@ -138,9 +138,9 @@ def test_the_parts_of_lingo():
 
 
 def test_opacities_have_no_row_of_means(tmp_path):
-    found = groups('ct', [4], [20], ['3dgs'])
+    grouped = groups('ct', [4], [20], ['3dgs'])
     cells = mock.Mock(get=lambda cell: dict(psnr_3d_r2=30.0, ssim_3d_r2=0.9))
-    rows = [(row['second'], row['object']) for row in results(found, ['foot'], [cells])]
+    rows = [(row['second'], row['object']) for row in results(grouped, ['foot'], [cells])]
     possible = 'fdk', 'sart', 'asd-pocs', 'sart-r2', 'asd-pocs-r2'
     assert rows == [(a, name) for a in possible for name in ('foot', 'mean of 1')] + [
         ('refined', 'foot'),
@@ -155,18 +155,18 @@ def test_opacities_have_no_row_of_means(tmp_path):
 
 
 def test_paper_beside_ours():
-    found = groups('views', [5, 25], [5000, 30_000], ['r2', 'lingo', 'fast'])
+    grouped = groups('views', [5, 25], [5000, 30_000], ['r2', 'lingo', 'fast'])
     cells = mock.Mock(get=lambda cell: dict(psnr_2d_r2=30.0 + cell.views, ssim_2d_r2=0.9, ipsd=None))
-    text = markdown('views', found, results(found, ['a', 'b'], [cells]))
+    text = markdown('views', grouped, results(grouped, ['a', 'b'], [cells]))
     assert '| 25 | 30000 | paper | 46.09 | 0.9899 | 0.1129 | 47.04 | 0.9911 | 0.0233 | – | – | – |' in text
     assert '| 5 | 5000 | mean of 2 | 35.00 | 0.9000 | – |' in text
-    found = groups('ct', [10], [30_000], ['lingo'])
+    grouped = groups('ct', [10], [30_000], ['lingo'])
     nothing = mock.Mock(get=lambda cell: None)
-    text = markdown('ct', found, results(found, ['a'], [nothing]))
+    text = markdown('ct', grouped, results(grouped, ['a'], [nothing]))
     assert '| 10 | asd-pocs | paper | 25.64 | 0.7215 | 28.90 | 0.8252 |' in text
-    found = groups('ablation', [25], [30_000], [])
+    grouped = groups('ablation', [25], [30_000], [])
     assert '| 25 | + + + | paper | 0.47 | 47.04 | 0.9911 | 0.0289 | 32.91 | 0.8924 |' in markdown(
-        'ablation', found, results(found, ['a'], [nothing])
+        'ablation', grouped, results(grouped, ['a'], [nothing])
     )
 
 
@@ -187,9 +187,9 @@ def test_controls_have_as_many_iterations_as_asked_for():
 # ---- interruptions ---------------------------------------------------------------------------------------------------
 
 
-def numbers(found):
+def numbers(table):
     return {
-        k: found[k] for k in ('psnr_2d_r2', 'psnr_2d', 'ssim_2d_r2', 'psnr_3d_r2', 'ssim_3d_r2', 'ipsd', 'gaussians')
+        k: table[k] for k in ('psnr_2d_r2', 'psnr_2d', 'ssim_2d_r2', 'psnr_3d_r2', 'ssim_3d_r2', 'ipsd', 'gaussians')
     }
 
 
@@ -286,7 +286,7 @@ def test_killed(tmp_path):
 
 def test_means_over_seeds_and_objects_with_their_errors():
     """A gain is a difference for each object. An object that is easy for every method does not widen its error."""
-    found = groups('views', [5], [20], ['r2', 'lingo'])
+    grouped = groups('views', [5], [20], ['r2', 'lingo'])
     values = {
         ('a', 'r2'): (30.0, 32.0),
         ('a', 'lingo'): (32.0, 34.0),
@@ -299,7 +299,7 @@ def test_means_over_seeds_and_objects_with_their_errors():
             get=lambda cell: dict(psnr_2d_r2=values[cell.object, cell.method][seed], ssim_2d_r2=0.9, ipsd=None)
         )
 
-    rows = {row['object']: row['columns'] for row in results(found, ['a', 'b'], [cells(0), cells(1)])}
+    rows = {row['object']: row['columns'] for row in results(grouped, ['a', 'b'], [cells(0), cells(1)])}
     shown = {name: (c['r2']['psnr_2d_r2'], c['lingo']['psnr_2d_r2']) for name, c in rows.items() if name != 'paper'}
     assert shown.pop('spread over seeds') == pytest.approx((np.sqrt((2 + 8) / 2), np.sqrt(2)))
     assert shown == {
@@ -314,9 +314,9 @@ def test_means_over_seeds_and_objects_with_their_errors():
 
 
 def test_gains_of_rows_are_over_the_first():
-    found = groups('controls', [25], [20], [])
-    assert [group.second for group in found] == list(CONTROLS)
-    for group in found:
+    grouped = groups('controls', [25], [20], [])
+    assert [group.second for group in grouped] == list(CONTROLS)
+    for group in grouped:
         method_for(group.columns[0].cell('foot'), TINY)  # has these options
     quality = {'r2': 30.0, 'lingo': 31.0}
 
@@ -327,7 +327,7 @@ def test_gains_of_rows_are_over_the_first():
             psnr_2d_r2=quality[cell.method] + (cell.object == 'b'), ipsd=0.1, gaussians=9, psnr_3d_r2=30, ssim_3d_r2=1
         )
 
-    rows = results(found, ['a', 'b'], [mock.Mock(get=get)])
+    rows = results(grouped, ['a', 'b'], [mock.Mock(get=get)])
     gains = [(row['second'], row['columns']['fit']['psnr_2d_r2']) for row in rows if row['object'] == 'gain over r2']
     assert gains == [('lingo', 1.0)]
 
@@ -378,9 +378,9 @@ def test_a_record_goes_on_without_the_files(tmp_path):
     record = tmp_path / 'kept' / 'cells.json'
     options = '--views', '4', '--methods', 'r2', '--iterations', '20', '--record', record
     assert script('views', tmp_path / 'a', *options, '--seeds', '0', '1')[0] == 0
-    kept = json.loads(record.read_text())
-    assert len(kept) == 2 and len(record.read_text().splitlines()) == 4
-    assert all('history' not in cell and cell['psnr_3d_r2'] > 0 and 'date' in cell for cell in kept.values())
+    cells = json.loads(record.read_text())
+    assert len(cells) == 2 and len(record.read_text().splitlines()) == 4
+    assert all('history' not in cell and cell['psnr_3d_r2'] > 0 and 'date' in cell for cell in cells.values())
     with mock.patch.object(Cells, 'compute', side_effect=AssertionError):
         code, text, err = script('views', tmp_path / 'b', *options, '--seeds', '0', '1')
     assert code == 0 and '2 of 2 cells' in text and 'seeds 0, 1' in text, err
@@ -420,17 +420,17 @@ def test_objects_finer_than_the_voxels(tmp_path):
     """What is scanned has twice the voxels; what is reconstructed, and its truth, has those of the scale."""
     scale = replace(TINY, finer=2)
     coarse, fine = Cells(tmp_path, TINY), Cells(tmp_path, scale)
-    found, usual, scanned = fine.dataset('foot'), coarse.dataset('foot'), make('foot', 32)
-    geometry = found.train.geometry
+    data, usual, scanned = fine.dataset('foot'), coarse.dataset('foot'), make('foot', 32)
+    geometry = data.train.geometry
     assert (
         (geometry.grid.shape, geometry.grid.spacing)
         == (usual.train.geometry.grid.shape, usual.train.geometry.grid.spacing)
         == ((16,) * 3, (16.0,) * 3)
     )
-    np.testing.assert_allclose(found.volume, scanned.data.reshape(16, 2, 16, 2, 16, 2).mean((1, 3, 5)), atol=1e-5)
+    np.testing.assert_allclose(data.volume, scanned.data.reshape(16, 2, 16, 2, 16, 2).mean((1, 3, 5)), atol=1e-5)
     expected = tables.scan(scanned, 25, 0, pixels=24)
-    np.testing.assert_array_equal(found.train.projections, expected.train.projections)
-    np.testing.assert_array_equal(found.test.projections, expected.test.projections)
+    np.testing.assert_array_equal(data.train.projections, expected.train.projections)
+    np.testing.assert_array_equal(data.test.projections, expected.test.projections)
     assert coarse.path(Fit('foot', 4, 'r2')) != fine.path(Fit('foot', 4, 'r2'))
     code, text, err = script(
         'ct',
@@ -483,11 +483,11 @@ def test_without_any_object_nothing_is_written(tmp_path, monkeypatch):
 def test_methods():
     assert method_for(Fit('foot', 5, 'r2', 7), TINY).iterations == 7
     assert method_for(Fit('foot', 5, 'fast'), TINY).iterations == Fast.iterations
-    found = method_for(Fit('foot', 5, 'lingo:V_S=1,n_points=70'), TINY)
+    method = method_for(Fit('foot', 5, 'lingo:V_S=1,n_points=70'), TINY)
     assert (
-        found.start.V_S,
-        found.start.n_points,
-        found.loss.loss_scale,
+        method.start.V_S,
+        method.start.n_points,
+        method.loss.loss_scale,
         method_for(Fit('foot', 5, 'r2'), TINY).start.n_points,
     ) == (1, 70, 'dynamic', 200)
     with pytest.raises(InputError, match='there is no method'):
@@ -515,8 +515,8 @@ def test_methods():
 )
 def test_bad_input(args, message, tmp_path):
     code, _, err = run(TABLES, *args, '--out', tmp_path / 'a')
-    said = err if isinstance(code, int) else code
-    assert code == 2 and message in said and said.count('\n') == 1 and said.startswith('error: ')
+    printed = err if isinstance(code, int) else code
+    assert code == 2 and message in printed and printed.count('\n') == 1 and printed.startswith('error: ')
     assert not (tmp_path / 'a').exists()
 
 

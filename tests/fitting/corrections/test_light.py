@@ -69,7 +69,7 @@ def test_the_light_is_a_constant_to_the_derivatives():
     """Of the loss by the densities, against differences with the light held fixed; without the light they are others."""
     stepper, state = stepper_of(effects_of(), lambda_tv=0.0)
     target, plain = stepper.targets[1], state.values['density']
-    found = {}
+    results = {}
     for lit in (False, True):
         if lit:
             [light] = stepper.corrections
@@ -81,16 +81,16 @@ def test_the_light_is_a_constant_to_the_derivatives():
         leaf = leaves(gaussians)
         stepper._compare(leaf, target, 1)
         pass_on(gaussians, map(dr.grad, leaf))
-        found[lit] = dr.grad(state.values['density']).numpy()
+        results[lit] = dr.grad(state.values['density']).numpy()
 
     def loss(values):
         state.values['density'] = values
         return float(stepper._compare(leaves(stepper.forward.gaussians(state.values)), target, 1)[0][0])
 
-    way = mi.Float(np.abs(np.random.default_rng(1).normal(size=len(state))).astype(np.float32) * np.sign(found[True]))
+    way = mi.Float(np.abs(np.random.default_rng(1).normal(size=len(state))).astype(np.float32) * np.sign(results[True]))
     expected = (loss(plain + 0.02 * way) - loss(plain - 0.02 * way)) / 0.04
-    assert (found[True] * way.numpy()).sum() == pytest.approx(expected, rel=2e-2)
-    assert (found[False] * way.numpy()).sum() != pytest.approx(expected, rel=5e-2)
+    assert (results[True] * way.numpy()).sum() == pytest.approx(expected, rel=2e-2)
+    assert (results[False] * way.numpy()).sum() != pytest.approx(expected, rel=5e-2)
 
 
 # ---- estimates -------------------------------------------------------------------------------------------------------

@@ -54,10 +54,10 @@ def test_what_the_detector_did_is_found(values, changes, within, better):
     """Of 8 views in 600 steps: air of 0.08 to 0.01, gains of 6 % to 1 %. The line integrals are better, too."""
     ideal = true_views()
     scan, true = measured(ideal, **values)
-    off, on = (run(scan, LONG.changed(n=300, **own), seed=3) for own in ({}, changes))
-    found, expected = on.model.response.report(), true.report()
+    off, on = (run(scan, LONG.changed(n=300, **options), seed=3) for options in ({}, changes))
+    actual, expected = on.model.response.report(), true.report()
     for name, limit in within.items():
-        assert np.abs(np.array(found[name]) - expected[name]).max() < limit, name
+        assert np.abs(np.array(actual[name]) - expected[name]).max() < limit, name
         assert np.abs(expected[name]).max() > 3 * limit
     errors = [rms(f.render(ideal.geometry) - ideal.projections) for f in (off, on)]
     assert errors[1] < better * errors[0]
@@ -71,12 +71,12 @@ def test_offsets_of_pixels_are_found():
     ideal = true_views()
     offsets = np.random.default_rng(0).normal(0, 0.2, ideal.geometry.nDetector).astype(np.float32)
     scan = Scan(ideal.geometry, ideal.projections + offsets)
-    off, on = (run(scan, LONG.changed(n=300, **own), seed=3) for own in ({}, dict(fit_pixels='one')))
-    found = on.model.response.parts[0].values.reshape(offsets.shape)
-    assert rms(found - offsets) < 0.6 * rms(offsets)
+    off, on = (run(scan, LONG.changed(n=300, **options), seed=3) for options in ({}, dict(fit_pixels='one')))
+    actual = on.model.response.parts[0].values.reshape(offsets.shape)
+    assert rms(actual - offsets) < 0.6 * rms(offsets)
     errors = [rms(f.render(ideal.geometry) - ideal.projections) for f in (off, on)]
     assert errors[1] < errors[0]
-    assert on.model.response.report()['pixel_offset_rms'] == pytest.approx([rms(found)])
+    assert on.model.response.report()['pixel_offset_rms'] == pytest.approx([rms(actual)])
 
 
 @pytest.mark.parametrize(('misfit', 'left'), [(0.005, 0.25), (0.1, 1.0)])
@@ -119,8 +119,8 @@ def test_dead_columns():
     scan, _ = measured(true_views(4), air=[[0.05], [0.03]])
     valid = np.ones(scan.projections.shape, bool)
     valid[..., ::2] = False
-    found = run(replace(scan, valid=valid), SHORT.changed(iterations=20, **ALL), seed=3)
-    assert np.isfinite(found.render(scan.geometry)).all()
+    fitted = run(replace(scan, valid=valid), SHORT.changed(iterations=20, **ALL), seed=3)
+    assert np.isfinite(fitted.render(scan.geometry)).all()
 
 
 def test_held_out_views_and_files_know_the_response(tmp_path, no_report):
@@ -165,7 +165,7 @@ def test_smooth_poses_hold_and_are_told_of_views_between():
     train, test = every.subset(slice(0, None, 2)), every.subset(slice(1, None, 2))
     changes = dict(rate_pose=(2e-3, 2e-4))
     off, view, smooth = (
-        run(train, LONG.changed(**own), seed=3) for own in ({}, changes, changes | dict(pose_motion='smooth'))
+        run(train, LONG.changed(**options), seed=3) for options in ({}, changes, changes | dict(pose_motion='smooth'))
     )
     held_out = [rms(f.expected(test.geometry) - test.projections) for f in (off, view, smooth)]
     assert held_out[2] < 0.6 * held_out[0] and held_out[2] < held_out[1]
@@ -191,14 +191,14 @@ def test_volumes_from_a_result_are_made_without_the_response(tmp_path, no_report
     scan, true = measured(true_views(8), air=[[0.05], [0.03]], gain=[[0], [0.06]])
     method = SHORT.changed(iterations=20, fit_air='smooth', fit_gain='smooth')
     fitted = run(scan, method, seed=3)
-    for part, known in zip(fitted.model.response.parts, true.parts):
-        part.values = known.values.copy()
+    for part, true_part in zip(fitted.model.response.parts, true.parts):
+        part.values = true_part.values.copy()
     fitted.checkpoint.arrays |= fitted.model.response.arrays()
     fitted.save(tmp_path / 'fit')
     ideal = true.undone(scan.projections, scan.geometry)
     assert np.abs(ideal - scan.projections).max() > 0.05
     for each in fitted, Fit.load(tmp_path / 'fit' / 'result.xml'):
-        found, _ = prepare_start(scan, each, SART())
-        np.testing.assert_allclose(found.projections, ideal, atol=1e-5)
+        prepared, _ = prepare_start(scan, each, SART())
+        np.testing.assert_allclose(prepared.projections, ideal, atol=1e-5)
         completed, _ = prepare_completed(scan, each, 16, SART())
         np.testing.assert_allclose(completed.projections[: len(scan)], ideal, atol=1e-5)

@@ -33,9 +33,9 @@ def test_integrals_are_those_of_the_sampled_field(changes):
     state = random_state(SMOOTH, amplitude=3)
     fine = g.on(g.grid.finer(3))
     volume = SMOOTH.model(g, 1.0).volume(DeviceState(state), fine.grid)
-    expected, found = grid.project_volume(volume, fine), rendered(SMOOTH, g, state)
+    expected, actual = grid.project_volume(volume, fine), rendered(SMOOTH, g, state)
     assert volume.std() > 0.01 and (expected > 0).mean() > 0.3
-    np.testing.assert_allclose(found, expected, atol=2e-3 * expected.max())
+    np.testing.assert_allclose(actual, expected, atol=2e-3 * expected.max())
 
 
 def test_error_falls_with_the_number_of_samples():
@@ -53,25 +53,25 @@ def test_error_falls_with_the_number_of_samples():
 def test_volume_is_the_field_at_the_voxel_centres():
     g, unit = views(nVoxel=(5, 4, 3), dVoxel=(8.0, 9.0, 10.0), offOrigin=(3.0, -2.0, 1.0)), 0.25
     state = random_state(SMALL)
-    found = SMALL.model(g, unit).volume(DeviceState(state))
+    volume = SMALL.model(g, unit).volume(DeviceState(state))
     side = SMALL.field.field_cube * 40  # of the cube, mm
     axes = [(np.arange(n) + 0.5 - n / 2) * d / side + 0.5 for n, d in zip(g.grid.shape, g.grid.spacing)]
     points = np.stack(np.meshgrid(*axes, indexing='ij'), -1).reshape(-1, 3)
     expected = unit * NumpyField(SMALL.field, state, np.float64).density(points).reshape(g.grid.shape)
-    np.testing.assert_allclose(found, expected, rtol=2e-5)
+    np.testing.assert_allclose(volume, expected, rtol=2e-5)
 
 
 def test_volume_on_another_grid_is_of_the_same_field_and_empty_outside():
     g, state = views(), DeviceState(random_state(SMALL))
     model = SMALL.model(g, 1.0)
-    own = model.volume(state)
+    inner = model.volume(state)
     # Voxels of the same size, shifted by whole ones.
     larger = replace(g.grid, shape=(40, 40, 40), centre=(8.0, 0.0, -8.0))
-    found = model.volume(state, larger)
+    outer = model.volume(state, larger)
     inside = np.zeros(larger.shape, bool)
     inside[3:35, 4:36, 5:37] = True
-    np.testing.assert_allclose(found[3:35, 4:36, 5:37], own, rtol=1e-5)
-    assert not found[~inside].any()
+    np.testing.assert_allclose(outer[3:35, 4:36, 5:37], inner, rtol=1e-5)
+    assert not outer[~inside].any()
 
 
 def test_views_do_not_depend_on_the_voxels_of_their_geometry():

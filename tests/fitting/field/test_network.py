@@ -29,10 +29,10 @@ def on_device(points):
 
 def test_density_is_that_of_a_reference_in_float64(method, points):
     state = random_state(method)
-    found = Network(method.field).density(DeviceState(state).values, on_device(points)).numpy()
+    density = Network(method.field).density(DeviceState(state).values, on_device(points)).numpy()
     expected = NumpyField(method.field, state, np.float64).density(points)
     assert expected.std() > 1e-3  # a field that varies
-    np.testing.assert_allclose(found, expected, rtol=2e-5)
+    np.testing.assert_allclose(density, expected, rtol=2e-5)
 
 
 def test_published_size():
@@ -48,7 +48,7 @@ def test_derivatives_are_those_of_a_reference_and_of_differences(method, points)
     for value in values.values():
         dr.enable_grad(value)
     dr.backward(dr.sum(Network(method.field).density(values, on_device(points)) * uploaded(weights)))
-    found = {k: dr.grad(v).numpy().astype(float) for k, v in values.items()}
+    gradients = {k: dr.grad(v).numpy().astype(float) for k, v in values.items()}
 
     reference = NumpyField(method.field, state, np.float64)
     reference.density(points)
@@ -56,7 +56,7 @@ def test_derivatives_are_those_of_a_reference_and_of_differences(method, points)
     expected = dict(features=features.ravel(), network=np.concatenate([x.ravel() for x in layers]))
     for name, gradient in expected.items():
         # float32 adds some hundred terms of either sign
-        np.testing.assert_allclose(found[name], gradient, atol=2e-5 * np.abs(gradient).max())
+        np.testing.assert_allclose(gradients[name], gradient, atol=2e-5 * np.abs(gradient).max())
         direction = np.random.default_rng(3).normal(size=gradient.shape)
         sums = []
         for step in (-1e-6, 1e-6):
@@ -64,7 +64,7 @@ def test_derivatives_are_those_of_a_reference_and_of_differences(method, points)
             moved.values[name] = (moved.values[name][:, 0].astype(float) + step * direction)[:, None]
             sums.append(NumpyField(method.field, moved, np.float64).density(points) @ weights)
         difference = (sums[1] - sums[0]) / 2e-6
-        assert found[name] @ direction == pytest.approx(difference, rel=2e-3, abs=1e-3 * np.linalg.norm(gradient))
+        assert gradients[name] @ direction == pytest.approx(difference, rel=2e-3, abs=1e-3 * np.linalg.norm(gradient))
 
 
 def test_forward_and_backward_derivatives_are_adjoint(points):

@@ -24,8 +24,8 @@ def test_names():
 def test_methods_by_name_and_value():
     assert method_of('lingo') == METHODS['lingo']
     assert method_of('lingo', iterations=7) == METHODS['lingo'].changed(iterations=7)
-    found = method_of('naf:rate_features=1e-2,1e-3,field_levels=7', iterations=7)
-    assert found == METHODS['naf'].changed(iterations=7, rate_features=(1e-2, 1e-3), field_levels=7)
+    method = method_of('naf:rate_features=1e-2,1e-3,field_levels=7', iterations=7)
+    assert method == METHODS['naf'].changed(iterations=7, rate_features=(1e-2, 1e-3), field_levels=7)
     with pytest.raises(InputError, match='lingo'):
         method_of('lingoX')
     with pytest.raises(InputError, match="unknown setting 'nothing'"):

@@ -60,8 +60,8 @@ def test_it_learns_densities_of_any_unit(factor, learnt):
     """Of matter, about 0.02 per mm; and beyond 1, which the published form cannot reach."""
     scan, fitted = learnt
     scaled = replace(scan, projections=scan.projections * np.float32(factor))
-    found = fit(scaled, fitted.method.changed(iterations=150))
-    assert error_of(found, scaled) < 0.2
+    refitted = fit(scaled, fitted.method.changed(iterations=150))
+    assert error_of(refitted, scaled) < 0.2
 
 
 def test_the_published_start_is_half_the_largest_density(scan):
@@ -75,8 +75,8 @@ def test_the_published_start_is_half_the_largest_density(scan):
 def test_from_half_the_largest_density_the_field_is_lost_at_first(learnt):
     """It falls to 0, where the sigmoid has no slope; from the scan's mean, as many steps suffice."""
     scan, fitted = learnt
-    found = fit(scan, fitted.method.changed(field_start='random'))
-    assert error_of(found, scan) > 5 * error_of(fitted, scan)
+    refitted = fit(scan, fitted.method.changed(field_start='random'))
+    assert error_of(refitted, scan) > 5 * error_of(fitted, scan)
 
 
 def test_unit_and_start_follow_the_scan(scan):
@@ -102,9 +102,9 @@ def test_resumed_fit_is_the_same_fit(scan, tmp_path, one_thread):
     again = fit(scan, path=path, resume=True)
     assert_equal_states(again.state, whole.state)
     assert [h['iteration'] for h in again.history] == [h['iteration'] for h in whole.history]
-    kept = Fit.load(path)
-    np.testing.assert_array_equal(kept.volume(), whole.volume())
-    np.testing.assert_array_equal(kept.render(scan.geometry), whole.render(scan.geometry))
+    resumed = Fit.load(path)
+    np.testing.assert_array_equal(resumed.volume(), whole.volume())
+    np.testing.assert_array_equal(resumed.render(scan.geometry), whole.render(scan.geometry))
 
 
 def test_a_search_leaves_the_steps_as_they_are(tmp_path, one_thread):
@@ -129,8 +129,8 @@ def test_a_step_descends_along_the_derivatives_of_its_loss(scan):
     method = SMALL.changed(batch=2, iterations=1)
     gradients = {}
 
-    def take(state, found, *_):
-        gradients.update({k: g.numpy() for k, g in found.items()})
+    def take(state, actual, *_):
+        gradients.update({k: g.numpy() for k, g in actual.items()})
 
     losses = []
     for views in ([0, 1], [0], [1]):
@@ -189,7 +189,7 @@ def test_the_threshold_of_private_copies_is_put_back(scan):
 
 
 @pytest.mark.parametrize(
-    'changes, said',
+    'changes, message',
     [
         (dict(lambda_ssim=0.1), "unknown setting 'lambda_ssim'"),
         (dict(lambda_tv=0.1), "unknown setting 'lambda_tv'"),
@@ -206,8 +206,8 @@ def test_the_threshold_of_private_copies_is_put_back(scan):
         (dict(field_cube=0.5), 'field_cube'),
     ],
 )
-def test_contradictory_options_are_refused(changes, said):
-    with pytest.raises(InputError, match=said):
+def test_contradictory_options_are_refused(changes, message):
+    with pytest.raises(InputError, match=message):
         method_of('naf', **changes)
 
 
@@ -218,20 +218,20 @@ def test_a_field_that_does_not_fit_into_memory_is_refused(scan, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    'change, said',
+    'change, message',
     [
         (lambda c: c.update({'values.features': c['values.features'][:-2]}), 'values.features'),
         (lambda c: c.pop('second.network'), 'second.network'),
         (lambda c: c.update({'array.initial': np.zeros((1, 3), np.float32)}), 'neural field'),
     ],
 )
-def test_damaged_checkpoints_are_refused(scan, tmp_path, change, said):
+def test_damaged_checkpoints_are_refused(scan, tmp_path, change, message):
     path = tmp_path / 'fit.npz'
     fit(scan, SMALL.changed(iterations=1), path=path)
     content = contents(path)
     change(content)
     rewrite(path, content)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         Fit.load(path)
 
 

@@ -363,8 +363,8 @@ def test_missing_views_come_from_the_checkpoint(result, scene, tmp_path):
     fitted = Fit.load(folder / 'checkpoint.npz')
     whole = complete_views(fitted_views(dataset.train, fitted.nominal_geometry), fitted, 8)
     expected = dataset.train.projections[1::2]  # the views that the fit has not seen
-    found = whole.projections[4:]
-    assert np.linalg.norm(found - expected) < 0.5 * np.linalg.norm(expected)
+    projections = whole.projections[4:]
+    assert np.linalg.norm(projections - expected) < 0.5 * np.linalg.norm(expected)
     np.testing.assert_allclose(whole.geometry.angles[4:], dataset.train.geometry.angles[1::2])
     reconstruct = FIT.with_name('reconstruct.py')
     complete_it = '--complete', folder / 'checkpoint.npz', '--views', '8', '--out', tmp_path / 'v.nii'

@@ -47,10 +47,10 @@ def test_the_volume_on_another_grid(fitted):
     """Smaller voxels in a part of the volume, beside its centre: the densities of the cloud at these places."""
     g = fitted.geometry
     part = Grid((6, 5, 4), tuple(0.4 * d for d in g.grid.spacing), (3.0, -2.0, 1.0))
-    found = fitted.volume(part)
+    volume = fitted.volume(part)
     expected = voxelize(*fitted.gaussians, part, extent=fitted.method.extent)
-    assert found.shape == (6, 5, 4) and expected.max() > 0
-    np.testing.assert_allclose(found, expected, atol=1e-4 * expected.max())
+    assert volume.shape == (6, 5, 4) and expected.max() > 0
+    np.testing.assert_allclose(volume, expected, atol=1e-4 * expected.max())
 
 
 def test_gaussians_on_the_faces_of_the_volume_stay():
@@ -79,6 +79,6 @@ def test_a_large_volume_is_made_in_slabs(monkeypatch, scene):
     slabs = mock.Mock(side_effect=density.voxelize)
     monkeypatch.setattr(density, 'voxelize', slabs)
     for grid, want in zip(grids, whole):
-        found = result.volume(grid)
-        assert found.shape == want.shape and abs(found - want).max() < 2e-6 * want.max() and want.max() > 0
+        volume = result.volume(grid)
+        assert volume.shape == want.shape and abs(volume - want).max() < 2e-6 * want.max() and want.max() > 0
     assert slabs.call_count == 8 + 9  # of 3 and of 2 slices each

@@ -35,8 +35,8 @@ def having(name):
     ],
 )
 def test_values(name, text, value):
-    found = lm.R2().changed(**{name: text}).flat()[name]
-    assert found == value and type(found) is type(value)
+    value_read = lm.R2().changed(**{name: text}).flat()[name]
+    assert value_read == value and type(value_read) is type(value)
 
 
 @pytest.mark.parametrize(
@@ -180,13 +180,13 @@ def test_extreme_values_of_the_parts(part):
 )
 def test_values_of_python(name, value, expected):
     for method in having(name):
-        found = method.changed(**{name: value}).flat()[name]
-        assert found == expected and type(found) is type(expected)
+        actual = method.changed(**{name: value}).flat()[name]
+        assert actual == expected and type(actual) is type(expected)
 
 
 def test_method_of():
-    found = method_of('lingo:V_S=1,n_points=70', n_points=90, iterations=5)
-    assert (found.start.V_S, found.start.n_points, found.iterations) == (1.0, 70, 5)
+    actual = method_of('lingo:V_S=1,n_points=70', n_points=90, iterations=5)
+    assert (actual.start.V_S, actual.start.n_points, actual.iterations) == (1.0, 70, 5)
     for method in ('LINGO', 'lingo:V=1', 'lingo:V_S', ':V_S=1', ''):
         with pytest.raises(InputError):
             method_of(method)
@@ -195,15 +195,15 @@ def test_method_of():
 @pytest.mark.parametrize('method', METHODS)
 def test_flat_names(method):
     """Every value has one, no two share one, and they are all that a method is."""
-    found = METHODS[method]
-    flat, parts = found.flat(), parts_of(found)
+    method_class = METHODS[method]
+    flat, parts = method_class.flat(), parts_of(method_class)
     named = [part for part in parts if part.name]
-    assert len(flat) == len(vars(found)) - len(parts) + len(named) + sum(len(vars(part)) for part in parts)
-    assert type(found)().changed(**flat) == found
+    assert len(flat) == len(vars(method_class)) - len(parts) + len(named) + sum(len(vars(part)) for part in parts)
+    assert type(method_class)().changed(**flat) == method_class
     if method in CLOUDS:
         assert lm.R2().changed(**flat).flat() == flat and lm.LINGO().changed(**flat).flat() == flat
-        assert flat['lambda_tv'] == found.loss.lambda_tv and flat['scale_min'] == found.bounds.scale_min
-        assert flat['start'] == found.start.name and flat['densify'] == found.densify.name
+        assert flat['lambda_tv'] == method_class.loss.lambda_tv and flat['scale_min'] == method_class.bounds.scale_min
+        assert flat['start'] == method_class.start.name and flat['densify'] == method_class.densify.name
 
 
 def test_changed_keeps_the_rest():
@@ -257,9 +257,9 @@ def test_limits(name, within, beyond):
 )
 def test_another_start_keeps_what_both_share(before, changes, after):
     """Their options, but for those that are as usual: then they are as usual in the other start."""
-    found = before.changed(**changes)
-    assert found.start == after and type(found.start) is type(after)
-    assert {k: v for k, v in vars(found).items() if k != 'start'} == {
+    changed = before.changed(**changes)
+    assert changed.start == after and type(changed.start) is type(after)
+    assert {k: v for k, v in vars(changed).items() if k != 'start'} == {
         k: v for k, v in vars(before).items() if k != 'start'
     }
 

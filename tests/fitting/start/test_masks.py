@@ -40,14 +40,14 @@ def test_points_stay_within_a_flat_volume():
 def test_cloud_follows_the_paper():
     geometry, frames, projections = sphere_scan()
     cloud = PAPER.from_views(Scan(geometry, projections), np.random.default_rng(1))
-    info, found = cloud.info, masks(projections)
+    info, masked = cloud.info, masks(projections)
     assert info['method'] == 'masks'
-    assert info['P'] == occupancy(frames, found, geometry.grid.half, geometry.grid.shape)
+    assert info['P'] == occupancy(frames, masked, geometry.grid.half, geometry.grid.shape)
     assert info['S'] == max(info['P'] * 20, 1)
     grid = tuple(max(round(n / info['S']), 8) for n in geometry.grid.shape)
     assert info['grid'] == grid
     assert len(cloud) == 2000 and info['points_high'] == 500 and info['points_low'] == 1500
-    low, high = valid_voxels(frames, found, grid, geometry.grid.half)
+    low, high = valid_voxels(frames, masked, grid, geometry.grid.half)
     assert (info['cells_low'], info['cells_high']) == (len(low), len(high))
     size = 2 * geometry.grid.half / grid
     cells = np.floor((cloud.points + geometry.grid.half) / size).astype(int)
@@ -122,10 +122,10 @@ def test_densities_of_an_fdk_volume():
             **more,
         )
 
-    found = cloud(fdk=volume)
-    expected = np.maximum(found.points @ slope, FAINTEST * volume.max())
-    assert (expected > FAINTEST * volume.max()).any() and (found.points @ slope < 0).any()
-    np.testing.assert_allclose(found.density, 4 * expected, rtol=1e-6)
+    filled = cloud(fdk=volume)
+    expected = np.maximum(filled.points @ slope, FAINTEST * volume.max())
+    assert (expected > FAINTEST * volume.max()).any() and (filled.points @ slope < 0).any()
+    np.testing.assert_allclose(filled.density, 4 * expected, rtol=1e-6)
     with pytest.raises(InputError, match='reconstruction'):
         cloud()
 
@@ -134,8 +134,8 @@ def test_empty_high_set_leaves_all_to_the_low_set():
     geometry, frames, projections = sphere_scan()
     projections = projections.copy()
     projections[0, :2, :2] = 60.0  # one bright corner: nothing but it is above this view's threshold
-    found = masks(projections)
-    assert len(valid_voxels(frames, found, (16, 16, 16), geometry.grid.half)[1]) == 0
+    masked = masks(projections)
+    assert len(valid_voxels(frames, masked, (16, 16, 16), geometry.grid.half)[1]) == 0
     start = MaskStart(n_points=100, density='paper', low_factor=0.001)
     cloud = start.from_views(Scan(geometry, projections), np.random.default_rng(0))
     assert cloud.info['points_high'] == 0 and len(cloud) == 100
