@@ -26,6 +26,7 @@ extensions = [
     'myst_parser',
     'sphinx.ext.autodoc',
     'mathml',
+    'gallery_links',
     'sphinx_gallery.gen_gallery',
     'plain_docstrings',
     'plugin_pages',
