@@ -1,6 +1,6 @@
 """
-What accuracy costs
-===================
+The cost of accuracy
+====================
 
 A Gaussian has no end; its footprint is cut off at some standard deviations. That is the one knob of accuracy: 3 is enough to fit
 (and what R2-Gaussian uses), 5 is the default for images, 7 leaves float32's own rounding.

@@ -21,7 +21,7 @@ PIECE = 16  # views that are read together where all are gone through
 
 
 class PixelEffects(Protocol):
-    """What a scan needs of its effects, whose class `effects.forward.Effects` is in a package above this one."""
+    """Properties of effects that a scan needs. The class `effects.forward.Effects` is in a package above this one."""
 
     def masked(self, scan: Scan) -> Scan:
         """The scan with dead pixels invalid."""
@@ -268,7 +268,7 @@ def values_digest(volume: np.ndarray) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """What a file of a scan may hold: views to fit, views held out, and the true volume [x, y, z], densities in 1/mm.
+    """Content of a scan's file: views to fit, views held out, and the true volume [x, y, z], densities in 1/mm.
 
     The volume may be an array of any library that has `__array__` or `__dlpack__`; InputError if it is none.
 

@@ -1,4 +1,4 @@
-"""What Mitsuba knows by name, one plugin a file. Installed as `lingo_mi.plugins`.
+"""The plugins that Mitsuba knows by name, a file each. They are installed as `lingo_mi.plugins`.
 
 A class that derives from a Mitsuba class belongs to one variant, so every file here is loaded anew for each variant.
 """

@@ -140,7 +140,7 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
         dr.backward_from(image * grad_in)
 
     def sample(self, *_: Any, **__: Any) -> Any:
-        """What an integrator around this one asks for: a single ray. Raises InputError."""
+        """Return the value of a single ray for an integrator around this one. Raises InputError."""
         raise InputError(
             'lingo_xray renders whole images, no single rays: take it out of the integrator around it (aov, moment), and '
             'render that one by itself, mi.render(scene, integrator=...)'

@@ -1,4 +1,4 @@
-"""What the studies' commands share: `python -m studies.NAME`, and a table that is renewed cell by cell."""
+"""Helpers of the studies' commands: `python -m studies.NAME`, and a table that is updated cell by cell."""
 
 from __future__ import annotations
 

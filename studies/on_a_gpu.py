@@ -62,7 +62,7 @@ class Part:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a part: its name, seconds, and 'done', 'failed (exit code 2)' or 'out of time'."""
+    """Outcome of a part: its name, seconds, and 'done', 'failed (exit code 2)' or 'out of time'."""
 
     name: str
     seconds: float

@@ -1,4 +1,4 @@
-"""What all tests share: the variant, slow tests, and the folder of test volumes."""
+"""Fixtures and options of all tests: the variant, slow tests, and the folder of test volumes."""
 
 import os
 import signal

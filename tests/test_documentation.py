@@ -1,4 +1,4 @@
-"""What the pages tell a reader to type or to open: Python that compiles, names and files that are there."""
+"""The code and links of the pages: Python that compiles, and names and files that exist."""
 
 import ast
 import csv

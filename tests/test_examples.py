@@ -29,7 +29,7 @@ def marked(path):
 
 
 def is_name(node):
-    """Whether a statement is a name alone, which a notebook shows."""
+    """Return whether a statement is a name alone, which a notebook shows."""
     return isinstance(node, ast.Expr) and isinstance(node.value, ast.Name)
 
 

@@ -1,4 +1,4 @@
-"""What an installation holds: every module, plugin and scene of the checkout."""
+"""The content of an installation: every module, plugin and scene of the checkout."""
 
 import json
 import os

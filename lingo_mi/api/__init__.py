@@ -1,1 +1,2 @@
-"""What `import lingo_mi as lm` offers: data, fits, results and volumes in a few calls. Loaded lazily by `lingo_mi`."""
+"""The functions and classes of `import lingo_mi as lm`: data, fits, results and volumes in a few calls. `lingo_mi` loads them
+lazily."""

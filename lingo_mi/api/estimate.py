@@ -48,7 +48,7 @@ class Estimate:
 
     @property
     def fits(self) -> bool:
-        """Whether the memory suffices."""
+        """True if the memory suffices."""
         return self.memory <= self.room
 
     def __repr__(self) -> str:

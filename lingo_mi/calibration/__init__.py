@@ -1,1 +1,1 @@
-"""What a scan says of its own errors: the panel's place, found by quick reconstructions before a fit."""
+"""Calibration of a scan by its own projections: quick reconstructions find the place of the panel before a fit."""

@@ -46,7 +46,7 @@ class Calibration:
 
     @property
     def needed(self) -> bool:
-        """Whether there is anything to correct."""
+        """True if there is anything to correct."""
         drift = self.found.drift
         moved = any(drift.u) or any(drift.v) or bool(drift.yaw)
         return moved or self._response is not None or self.air is not None
@@ -94,7 +94,7 @@ class Calibration:
         return replace(scan, geometry=self.found.drift.panel(scan.geometry).moved(scan.geometry))
 
     def lines(self) -> list[str]:
-        """What was found, in sentences."""
+        """Describe the result in sentences."""
         f, pixel = self.found, dict(zip('vu', self.geometry.dDetector))
         lines = []
         if self.air is not None:

@@ -47,7 +47,7 @@ def _counted(angles: np.ndarray) -> np.ndarray:
 
 
 def _in_order(angles: np.ndarray) -> bool:
-    """Whether they rise, or fall, from each to the next."""
+    """Return whether the angles only rise or only fall."""
     turns = np.diff(angles)
     return bool(np.all(turns > 0) or np.all(turns < 0))
 
@@ -80,7 +80,7 @@ class Drift:
 
     @property
     def constant(self) -> bool:
-        """Whether all views have the panel in the same place."""
+        """True if all views have the panel in the same place."""
         return not any(self.v[1:]) and not any(self.u[1:])
 
     def panel(self, geometry: Geometry) -> Panel:

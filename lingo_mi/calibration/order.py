@@ -1,4 +1,4 @@
-"""Whether angles, order and geometry of the views fit together: then views predict each other.
+"""Consistency of the angles, order and geometry of the views: if they are right, views predict each other.
 
 Every view is predicted from a quick reconstruction of other views (`cross_prediction`), with the views as given, in the opposite
 sense, and in a random order. On sound scans of 20 views or more (of a walnut and a disc with holes, measured, and eight simulated
@@ -29,7 +29,8 @@ NEIGHBOURS = 5  # views, in the order of the scan
 
 
 def order_faults(scan: Scan) -> list[str]:
-    """What contradicts the angles and the order of the views, in sentences; none for a sound scan or one of few views.
+    """Describe contradictions between the projections and the angles or the order of the views, in sentences. The list is
+    empty for a sound scan and for a scan of few views.
 
     Of many views, evenly spaced ones are compared. Takes four quick reconstructions.
 
@@ -55,7 +56,7 @@ def order_faults(scan: Scan) -> list[str]:
     signal = np.sqrt(np.square(small.projections).mean())
 
     def times(order):
-        """How many times larger the differences are if the views of this order take the places of the original ones."""
+        """Return the factor by which the differences grow if the views of this order take the places of the original views."""
         return np.sqrt(np.square(_differences(replace(small.subset(order), geometry=small.geometry))).mean()) / total
 
     if total > ROUND * signal and times(shuffled) < WORSE:

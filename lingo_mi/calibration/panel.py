@@ -12,7 +12,7 @@ from lingo_mi.geometry import CircularGeometry, Geometry
 
 @dataclass(frozen=True)
 class Panel:
-    """How the real panel lies relative to the one that a geometry names.
+    """Position of the real panel relative to the panel that a geometry describes.
 
     A shift along u is an axis of rotation off centre, and a yaw an axis that is not parallel to the columns.
 

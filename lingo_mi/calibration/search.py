@@ -46,7 +46,7 @@ FLOOR = 0.03  # of a step for differences: no standard error is smaller, since v
 
 @dataclass(frozen=True)
 class SearchResult:
-    """What the search has found.
+    """Result of a search.
 
     Parameters
     ----------
@@ -203,7 +203,7 @@ def search(
 
 
 def _determined(scan, degree):
-    """Which numbers a scan tells: of one row neither height nor turn."""
+    """Return the numbers that a scan determines. A scan of one row determines neither height nor turn."""
     drifts = range(1, degree + 1)
     names = ['u', *(f'u{k}' for k in drifts)]
     if min(scan.geometry.nDetector) < 8 or scan.geometry.grid.shape[2] == 1:

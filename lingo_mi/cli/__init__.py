@@ -76,7 +76,7 @@ def run(command: str) -> None:
 
 
 def summary() -> str:
-    """What `lingo-mi --help` prints: the commands in groups, each with an example."""
+    """Return the text of `lingo-mi --help`: the commands in groups, each with an example."""
     width = max(map(len, COMMANDS))
     lines = ['usage: lingo-mi COMMAND ...   (lingo-mi COMMAND --help)', '']
     for title, commands in GROUPS.items():

@@ -1,4 +1,4 @@
-"""What the commands share: clear failures, Ctrl-C, and the arguments of a scene and of the documentation."""
+"""Helpers of all commands: clear failures, Ctrl-C, and the arguments of a scene and of the documentation."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ SCANNER = 'scanner'  # the shipped scene of projections that come without one
 
 
 def input_name(args: argparse.Namespace) -> str:
-    """What results are named after: the scene, or the scan that was given in its place."""
+    """Return the name that results get: the name of the scene, or of the scan that replaces it."""
     scene = Path(args.scene).stem
     return Path(args.projections).stem if scene == SCANNER and args.projections else scene
 
@@ -324,7 +324,8 @@ def check_threads(args: argparse.Namespace) -> None:
 
 @contextmanager
 def runner_of(args: argparse.Namespace, folder: Path) -> Iterator[Any]:
-    """What runs jobs, by the arguments that `cluster_arguments` added: this process, or a cluster, which is open in the block.
+    """Return the runner of jobs that the arguments of `cluster_arguments` choose: this process, or a cluster that is open in
+    the block.
 
     Parameters
     ----------

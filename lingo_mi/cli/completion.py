@@ -1,4 +1,4 @@
-"""What `lingo-mi --print-completion SHELL` prints: a script with which a shell completes commands, options and files.
+"""The text of `lingo-mi --print-completion SHELL`: a script by which a shell completes commands, options and files.
 
 lingo-mi --print-completion bash > ~/.local/share/bash-completion/completions/lingo-mi
 lingo-mi --print-completion zsh > ~/.zfunc/_lingo-mi     # a folder of $fpath
@@ -46,5 +46,5 @@ def whole_parser(files: Any) -> Parser:
 
 
 def _names_a_file(action: argparse.Action) -> bool:
-    """Whether a file may be meant: any word that is neither a number nor one of a few."""
+    """Return whether a file may be meant: any word that is neither a number nor one of a few."""
     return action.nargs != 0 and action.choices is None and action.type in (None, Path)

@@ -1,4 +1,4 @@
-"""What `inspect` prints: findings as sentences, and what to correct with which option."""
+"""The text of `lingo-mi inspect`: findings as sentences, and the option that corrects each."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def advice(scan: Scan, findings: Findings) -> list[str]:
 
 
 def _placement(scan, findings):
-    """What to correct in the geometry."""
+    """List the corrections of the geometry."""
     orbit, lines = findings.orbit, []
     if findings.wide:
         lines.append(
@@ -168,7 +168,7 @@ def _air_spread(findings):
 
 
 def _calibrated(findings):
-    """How `calibrate` takes out a drift of the air level."""
+    """Say how `calibrate` removes a drift of the air level."""
     if findings.air is not None:
         return 'take it out with lingo-mi calibrate SCAN --out F.npy'
     return 'take out what is smooth in time with lingo-mi calibrate SCAN --air --out F.npy'

@@ -55,7 +55,7 @@ def main() -> None:
 
 
 def _compare_views(scan: Scan) -> tuple[list[str], list[str]]:
-    """What quick reconstructions say of the views' order, and why they cannot be made."""
+    """Describe what quick reconstructions show about the order of the views, or why they cannot be made."""
     from lingo_mi.calibration.order import order_faults
     from lingo_mi.common.runtime import ensure_variant
 

@@ -1,4 +1,4 @@
-"""What commands that make the paper's tables share: their arguments, and the cells that are still missing."""
+"""Helpers of the commands that make the paper's tables: their arguments, and the cells that are still missing."""
 
 from __future__ import annotations
 

@@ -138,7 +138,7 @@ def check_views(views: int) -> None:
 
 
 def bolts_beside(path: Path) -> Path:
-    """Where the bolts of a flange in `path` go."""
+    """Return the path of the bolts of the flange in `path`."""
     return path.with_stem(path.stem + '_bolts')
 
 

@@ -1,4 +1,4 @@
-"""What `lingo-mi --version` prints: versions of all that a result depends on, for a report of a bug."""
+"""The text of `lingo-mi --version`: the versions of all software that a result depends on, for a bug report."""
 
 from __future__ import annotations
 

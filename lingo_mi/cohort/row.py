@@ -94,8 +94,8 @@ class Row:
         return method_of(self.method, **self.settings)
 
     def request(self) -> dict:
-        """What a stored result must be the answer to: the file, by its name in the list, its size and the contents of its scan,
-        and all else that the numbers depend on."""
+        """Describe the request that a stored result must answer: the file's name in the list, its size, the contents of its
+        scan, and everything else that the numbers depend on."""
         path = self.path
         size = path.stat().st_size if path is not None and path.is_file() else None
         settings = _asked(self.fit_method())

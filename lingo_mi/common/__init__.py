@@ -1,1 +1,1 @@
-"""What every package may use: errors, progress, arrays, the machine."""
+"""Tools of every package: errors, progress, arrays, the machine."""

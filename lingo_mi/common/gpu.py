@@ -1,4 +1,5 @@
-"""What the CUDA driver says of the GPU that Dr.Jit uses: the first of those that CUDA_VISIBLE_DEVICES names, or of all.
+"""Properties of the GPU that Dr.Jit uses, from the CUDA driver: the first GPU in CUDA_VISIBLE_DEVICES, or the first of all
+GPUs.
 
 The driver is asked itself: pynvml knows neither the number of multiprocessors nor CUDA_VISIBLE_DEVICES.
 """

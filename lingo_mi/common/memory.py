@@ -1,4 +1,4 @@
-"""How much memory this process may take for the arrays that it computes on.
+"""The memory that this process may take for its arrays.
 
 psutil knows the memory of the machine on every system, but in a container the control group sets the limit.
 """
@@ -63,7 +63,7 @@ def _control_groups(groups: Path = Path('/proc/self/cgroup'), mounted: Path = Pa
 
 
 def _address_space() -> float:
-    """What is left of RLIMIT_AS (`ulimit -v`): code, and what Dr.Jit has set aside, have taken some of it."""
+    """Return the rest of RLIMIT_AS (`ulimit -v`). Code, and memory that Dr.Jit has set aside, take some of it."""
     try:
         import resource
     except ImportError:  # Windows

@@ -1,4 +1,4 @@
-"""How far points are from their neighbours."""
+"""Distances of points from their neighbours."""
 
 from __future__ import annotations
 

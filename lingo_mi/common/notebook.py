@@ -1,4 +1,4 @@
-"""How images and volumes show themselves in a notebook: HTML of one sprite each, with a slider over its frames.
+"""Images and volumes in a notebook: HTML with one sprite each, and a slider over its frames.
 
 Everything is in the markup, so that it stays in a saved notebook and in pages that are built from one. Where scripts are off, the
 frame in the middle is seen.

@@ -101,7 +101,7 @@ class Detector:
 
     @property
     def measures(self) -> bool:
-        """Whether the electronics change the signal: noise, gains, saturation, digits or dead pixels."""
+        """True if the electronics change the signal: noise, gains, saturation, digits or dead pixels."""
         return any((self.photons, self.saturation, self.bits, self.dead, self.gain))
 
     @property

@@ -43,7 +43,7 @@ class Effects:
 
     @property
     def ideal(self) -> bool:
-        """Whether the expected signal is exp(-line integral) along the ray through a pixel's centre."""
+        """True if the expected signal is exp(-line integral) along the ray through a pixel's centre."""
         return not (
             self.tube
             and self.tube.hardens
@@ -64,7 +64,7 @@ class Effects:
 
     @property
     def needs_materials(self) -> bool:
-        """Whether it matters what the objects are made of."""
+        """True if the effects depend on the materials of the objects."""
         return self.tube is not None and (self.tube.hardens or self.scatter is not None)
 
     def of_cloud(self) -> Effects:

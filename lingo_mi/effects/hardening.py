@@ -118,7 +118,7 @@ class Tube:
 
     @property
     def hardens(self) -> bool:
-        """Whether the spectrum changes line integrals: photons of the reference energy alone do not."""
+        """True if the spectrum changes line integrals: photons of the reference energy alone do not."""
         return not (len(self.spectrum.energies) == 1 and self.spectrum.energies[0] == self.reference)
 
     def materials_of(self, name: str) -> tuple[str, ...]:

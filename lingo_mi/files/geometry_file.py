@@ -221,7 +221,7 @@ def flat_panel(geometry):
 
 
 def on_circle(geometry):
-    """Whether the numbers of a circle describe a scan: a curved panel off the central ray is turned, too."""
+    """Return whether a circle's numbers describe a scan. A curved panel off the central ray is turned, too."""
     flat = flat_panel(geometry)
     return isinstance(flat, CircularGeometry) and (flat is geometry or not flat.offDetector[1])
 
@@ -244,7 +244,8 @@ def geometry_file_of(path: Path, geometry: PathLike | str | None = None) -> Any:
 
 
 def rows_run_up(values: dict, name: str = 'poses') -> bool:
-    """Whether the rows of the projections that go with a geometry file's values run up: RTK's do, this package's run down."""
+    """Return whether the rows of the projections run up that belong to a geometry file's values. RTK's rows run up; this
+    package's rows run down."""
     return str(values.get(name)).lower().endswith('.xml')
 
 

@@ -150,7 +150,7 @@ def require_codecs(path: Path, folder: Path) -> int:
 
 
 def _names(codecs):
-    """What is said to be the names of codecs, and of those that they hold."""
+    """Return the names of codecs, and of the codecs inside them, as the metadata state them."""
     for codec in codecs if isinstance(codecs, list) else [codecs]:
         if not isinstance(codec, dict):
             yield from [] if codec is None else [codec]

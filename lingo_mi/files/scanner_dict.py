@@ -102,7 +102,7 @@ def _dimensions(value) -> int:
 
 
 def moves(values: dict, n: int) -> bool:
-    """Whether a scanner of n views leaves the circle: by a name of MOTION, or a number given for every view."""
+    """Return whether a scanner of n views leaves the circle: it has a name of MOTION, or a number for every view."""
     lengths = dict(DSO=1, DSD=1, offDetector=2, offOrigin=3)
     several = any(
         _dimensions(values[k]) == (2 if length > 1 else 1) and (length > 1 or len(values[k]) > 1)

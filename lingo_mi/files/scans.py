@@ -221,7 +221,7 @@ def read_scan(path: PathLike | str, geometry: PathLike | str | None = None, name
 
 
 def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name: str = 'ta') -> Callable[[], Dataset]:
-    """What reads a scan when it is called.
+    """Return a function that reads the scan when it is called.
 
     Raises
     ------
@@ -270,7 +270,7 @@ _WRITERS = {'naf': naf.write_naf, 'r2': r2.write_r2, 'exr': _write_exr_folder, '
 
 
 def history_of(path: PathLike | str) -> Any:
-    """What a scan's geometry file says of how it was made; None if it says nothing.
+    """Return the history in a scan's geometry file, which says how the scan was made; None if the file has no history.
 
     Raises
     ------

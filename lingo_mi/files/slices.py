@@ -108,7 +108,7 @@ def _of_ome(text):
 
 
 def _of_imagej(file, page):
-    """As `_of_ome`. A stack whose slices are 1 unit apart does not say so."""
+    """Read an ImageJ stack like `_of_ome`. A stack with slices 1 unit apart does not say so."""
     metadata = file.imagej_metadata or {}
     if 'unit' not in metadata or not {'XResolution', 'YResolution'} <= {tag.name for tag in page.tags}:
         return []

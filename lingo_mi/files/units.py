@@ -45,7 +45,7 @@ class Unit:
 
     @property
     def description(self) -> str:
-        """As it stands in a file."""
+        """The unit's text in a file."""
         if self.mu_water is not None:
             return f'HU, water {self.mu_water!r} per mm'
         return 'density per cm' if self.name == '1/cm' else 'density per mm'

@@ -93,7 +93,7 @@ class Checkpoint:
 
     @property
     def searching(self) -> bool:
-        """Whether this is of a search for the step to stop at, and not of the fit itself."""
+        """True if the checkpoint belongs to a search for the last step, and not to the fit itself."""
         return self.seen < len(self.geometry)
 
     def save(self, path: PathLike | str) -> None:

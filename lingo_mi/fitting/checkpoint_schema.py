@@ -1,4 +1,4 @@
-"""What a checkpoint holds, checked as a whole: names, types, shapes that agree with each other, ranges.
+"""The content of a checkpoint, checked as a whole: names, types, ranges, and shapes that agree with each other.
 
 values.*, first.*, second.*   float32 [N, size], the parameters of the method and Adam's moments; of a neural field, for which N
                               and M are 0, float32 [parameters, 1]
@@ -162,14 +162,14 @@ def _count(value: Any, least: int = 0, most: float = math.inf) -> bool:
 
 
 def _number(value: Any, least: float = -math.inf) -> bool:
-    """Whether a value is a finite number from `least` on. Those that float64 cannot hold are not."""
+    """Return whether a value is a finite number of at least `least`. A number beyond float64 is not."""
     if not isinstance(value, int | float) or isinstance(value, bool) or abs(value) > 1e300:
         return False
     return math.isfinite(value) and value >= least
 
 
 def _is_rng(value: Any) -> bool:
-    """Whether this is the state of NumPy's PCG64."""
+    """Return whether this is the state of NumPy's PCG64."""
     if not isinstance(value, dict) or value.keys() != {'bit_generator', 'state', 'has_uint32', 'uinteger'}:
         return False
     state = value['state']
@@ -184,7 +184,7 @@ def _is_rng(value: Any) -> bool:
 
 
 def _is_scan(value: Any) -> bool:
-    """Whether this is an `identity` of a scan."""
+    """Return whether this is an `identity` of a scan."""
     return (
         isinstance(value, dict)
         and value.keys() == {'views', 'signal', 'moments', 'valid', 'effects'}
@@ -198,7 +198,7 @@ def _is_scan(value: Any) -> bool:
 
 
 def _is_search(value: Any) -> bool:
-    """Whether this is the record of a search; see `stopping`."""
+    """Return whether this is the record of a search; see `stopping`."""
     return value is None or (
         isinstance(value, dict)
         and value.keys() == {'best', 'iterations', 'errors'}
@@ -210,7 +210,7 @@ def _is_search(value: Any) -> bool:
 
 
 def _is_history(value: Any) -> bool:
-    """Whether these are measurements over time. Those of quality may be missing (None), NaN or infinite."""
+    """Return whether these are measurements over time. Values of quality may be missing (None), NaN or infinite."""
     return isinstance(value, list) and all(
         isinstance(entry, dict)
         and _count(entry.get('iteration'), 1)
@@ -223,7 +223,7 @@ def _is_history(value: Any) -> bool:
 
 
 def _is_scanner(value: Any) -> bool:
-    """Whether this may be what `scene.description.describe` gives: no file is named."""
+    """Return whether this may be a result of `scene.description.describe` that names no file."""
     return (
         isinstance(value, dict)
         and value.get('type') == 'ct_scanner'

@@ -49,7 +49,7 @@ class DeviceState:
         )
 
     def finite(self) -> bool:
-        """Whether all parameters are finite; waits for the device."""
+        """Return whether all parameters are finite; waits for the device."""
         totals: dict[int, Any] = {}  # by width: all parameters of the Gaussians have the same
         for x in self.values.values():
             total = x if isinstance(x, mi.Float) else dr.sum(x)

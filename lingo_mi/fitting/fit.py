@@ -116,7 +116,7 @@ class Fit(FittedModel):
 
     @property
     def record(self) -> dict:
-        """What metrics.json says of a loaded fit, or would say: `numbers`, method and settings, scan, software."""
+        """The record in metrics.json, of a loaded fit or of one not yet saved: `numbers`, method and settings, scan, software."""
         return self._stored if self.data is None and self._stored else self.numbers | description(self)
 
     def metrics(self, data: Dataset | None = None) -> dict[str, float | None]:

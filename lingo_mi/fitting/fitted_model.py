@@ -1,4 +1,4 @@
-"""What a fit has fitted: a model at a state, to be rendered and voxelized."""
+"""The result of a fit: a model and its state, which can be rendered and voxelized."""
 
 from __future__ import annotations
 
@@ -54,12 +54,12 @@ class FittedModel:
 
     @property
     def info(self) -> dict:
-        """What the start has measured."""
+        """Measurements of the start."""
         return self.checkpoint.info
 
     @property
     def search(self) -> dict | None:
-        """What the search for the step to stop at has seen (`fitting.stopping`); None without one."""
+        """Record of the search for the last step (`fitting.stopping`); None without a search."""
         return self.checkpoint.search
 
     @property
@@ -123,7 +123,8 @@ class FittedModel:
 
     @drjit_lock()
     def expected(self, geometry: Geometry) -> np.ndarray:
-        """What the scan's detector is expected to measure in views that were taken among those of the scan, float32 [view, v, u].
+        """Return the values that the scan's detector is expected to measure, float32 [view, v, u]. The views were taken among
+        the views of the scan.
 
         That is `render`, with the response and with the smooth corrections of poses that were fitted, for the time of the views.
         """
@@ -184,7 +185,7 @@ class FittedModel:
 
     @cached_property
     def _stored(self) -> dict | None:
-        """What the folder's metrics.json says; None without one."""
+        """Content of the folder's metrics.json; None without one."""
         file = None if self.folder is None else self.folder / METRICS
         if file is None or not file.exists():
             return None

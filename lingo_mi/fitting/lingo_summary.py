@@ -1,4 +1,4 @@
-"""What the parts of LINGO did in a fit, in one line."""
+"""One line about what the parts of LINGO did in a fit."""
 
 from __future__ import annotations
 

@@ -247,7 +247,7 @@ class _Tiles:
 
     @staticmethod
     def _inside(tile, k, size):
-        """Whether tap k of a tile lies in the image, along an axis of `size` pixels."""
+        """Return whether tap k of a tile lies in the image, along an axis of `size` pixels."""
         return tile > 0 if k < 0 else tile * TILE + k < size
 
     @staticmethod

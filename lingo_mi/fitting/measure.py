@@ -99,7 +99,7 @@ def summary(result: dict) -> str:
 
 
 def _view_quality(result: dict) -> list[str]:
-    """How well held-out views are predicted, as lines."""
+    """Describe in lines how well held-out views are predicted."""
     lines = []
     if _any(result, 'psnr_2d', 'ssim_2d'):
         lines.append(f'held-out views  {_shown(result, "psnr_2d", "ssim_2d")}')
@@ -111,7 +111,7 @@ def _view_quality(result: dict) -> list[str]:
 
 
 def _fitted_to(result: dict) -> str:
-    """What was fitted, of what size: the first words of its line."""
+    """Return the first words of the line: the model that was fitted, and its size."""
     if result['gaussians']:
         return f'cloud           {result["gaussians"]:,} Gaussians'
     return f'neural field    {result["parameters"]:,} parameters'

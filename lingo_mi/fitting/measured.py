@@ -1,4 +1,4 @@
-"""What a fit uses of its scan: trusted pixels, their weights, modelled effects, the unit of density."""
+"""The part of a scan that a fit uses: trusted pixels, their weights, modelled effects, the unit of density."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def weights_of(scan: Scan, weights: str) -> np.ndarray | None:
 
 
 def knows_noise(scan: Scan) -> bool:
-    """Whether the photons of a pixel in the open beam are known."""
+    """Return whether the photons of a pixel in the open beam are known."""
     effects = effects_of(scan)
     return bool(effects and effects.detector and effects.detector.photons)
 

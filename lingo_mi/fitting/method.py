@@ -87,7 +87,7 @@ class Method(Part, ABC):
 
     @abstractmethod
     def model(self, geometry: Geometry, unit: float, effects: Effects | None = None) -> Model:
-        """What renders and voxelizes a state of a fit to a scan of this geometry.
+        """Return the model that renders and voxelizes a state of a fit to a scan of this geometry.
 
         Parameters
         ----------
@@ -121,7 +121,7 @@ class Method(Part, ABC):
         return replace(self, stopping=replace(self.stopping, stop='on' if stops else 'off'))
 
     def _stops(self, scan: Scan) -> bool:
-        """Whether a fit stops early, by views that are held out."""
+        """Return whether a fit stops early, by held-out views."""
         stop, valid = self.stopping.stop, trusted(scan, self.effects).valid
         views = len(scan) if valid is None else int(valid.any((1, 2)).sum())
         why = None
@@ -135,12 +135,12 @@ class Method(Part, ABC):
 
     @property
     def frees_views(self) -> bool:
-        """Whether every view has a pose of its own to fit, so that none can be predicted from others."""
+        """True if every view has a pose of its own to fit, so that no view can be predicted from others."""
         return False
 
     @property
     def extensible(self) -> bool:
-        """Whether a longer fit repeats the steps of a shorter one, so that it can go on from its checkpoint."""
+        """True if a longer fit repeats the steps of a shorter one, so that it can go on from its checkpoint."""
         return self.rates.average == 0 and self.rates.decay_steps > 0 and self.stopping.stop == 'off'
 
     def rate(self, name: str, iteration: int) -> float:

@@ -1,4 +1,4 @@
-"""What rendered views leave of measured ones, beside the noise of these."""
+"""Differences between rendered and measured views, beside the noise of the measured views."""
 
 from __future__ import annotations
 

@@ -17,8 +17,8 @@ from lingo_mi.scene.description import describe
 
 
 def identity(scan: Scan) -> dict:
-    """What tells a scan from others of the same geometry, as plain values: number of views, mean and moments of the projections,
-    digests of the valid pixels and of the effects."""
+    """Return plain values that tell a scan from others of the same geometry: the number of views, mean and moments of the
+    projections, and digests of the valid pixels and of the effects."""
     e = effects_of(scan)
     named = None
     if e is not None:

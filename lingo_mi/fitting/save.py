@@ -101,7 +101,7 @@ def write_fit(
 
 
 def description(fit: FittedModel) -> dict:
-    """What metrics.json says of a fit besides its numbers: method and settings, scan, corrections, software."""
+    """Return the content of metrics.json besides the numbers of a fit: method and settings, scan, corrections, software."""
     return dict(
         method=fit.method.name,
         seed=fit.checkpoint.seed,
@@ -134,8 +134,8 @@ def _write_views(folder: Path, rendered: np.ndarray):
 
 
 def _corrections(fit: FittedModel) -> dict:
-    """What was fitted besides the cloud, to be read: the response (levels, per cent), and corrections of the views' poses,
-    rotation vectors and shifts about the volume's centre."""
+    """Return the fitted corrections in readable units: the response (levels, per cent), and the corrections of the views'
+    poses as rotation vectors and shifts about the volume's centre."""
     poses, response = fit.poses, fit.model.response
     numbers = {} if response is None else dict(response=response.report())
     if poses is None:

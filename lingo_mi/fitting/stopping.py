@@ -1,4 +1,4 @@
-"""When a fit stops: a first fit, of part of the views, finds the step after which it predicts the other views no better.
+"""The end of a fit: a first fit, to part of the views, finds the step after which it predicts the other views no better.
 
 A fit of noisy projections is at its best before it has met them: later steps turn noise into structure, and what the views do not
 determine into streaks. Neither shows in the views that are fitted, nor in single pixels or rows that are held out of them,
@@ -46,7 +46,7 @@ class HeldOut:
         self._norm = power(self.views.projections).mean() or 1.0
 
     def due(self, iteration: int) -> bool:
-        """Whether to judge after so many steps."""
+        """Return whether to judge after so many steps."""
         return iteration % self._every == 0 or iteration == self._last
 
     def judge(self, iteration: int, stepper: Stepper, state: DeviceState) -> None:
@@ -62,13 +62,13 @@ class HeldOut:
 
     @property
     def over(self) -> bool:
-        """Whether the search has seen enough."""
+        """True if the search has seen enough."""
         steps = self.record['iterations']
         return bool(steps) and (steps[-1] == self._last or steps[-1] - self.record['best'] >= self._patience)
 
 
 def sentence(record: dict) -> str:
-    """What a search has decided."""
+    """Describe the decision of a search."""
     best, last = record['best'], record['iterations'][-1]
     if best == last:
         return f'took all {best} steps: the held-out error fell to the end'

@@ -63,7 +63,7 @@ def random_cube_variation(
 
 
 def _near(gaussians, low, high, extent):
-    """Which Gaussians may reach into a box."""
+    """Return the Gaussians that may reach into a box."""
     centre, scale = dr.detach(gaussians[0]), dr.detach(gaussians[1])
     reach = dr.max(scale) * extent
     return dr.all((centre + reach > mi.Vector3f(low)) & (centre - reach < mi.Vector3f(high)))

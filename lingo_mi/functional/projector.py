@@ -234,7 +234,7 @@ class Backprojector(LinearMap):
 
 
 def _transposed(shape: tuple[int, int], views: int) -> Any:
-    """Where the pixels of `views` images of a shape (slow, fast) stand in the images of the other order."""
+    """Return the indices of the pixels of `views` images of a shape (slow, fast) in images of the other order."""
     slow, fast = shape
     index = dr.arange(mi.UInt, views * slow * fast)
     line = index // fast

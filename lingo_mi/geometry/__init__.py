@@ -1,4 +1,4 @@
-"""Where a scan's rays and voxels are: scanners in TIGRE's terms, poses, and what other packages call them. Needs no Mitsuba."""
+"""Rays and voxels of a scan: scanners in TIGRE's terms, poses, and the conventions of other packages. Needs no Mitsuba."""
 
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.camera import camera_matrices

@@ -126,7 +126,7 @@ def to_cylinder_vectors(geometry: CurvedGeometry) -> np.ndarray:
 
 
 def _bent_towards_source(rays):
-    """Whether ASTRA bends the panels of `rays`, its own, towards their sources, [n]."""
+    """Return whether ASTRA bends the panels of its `rays` towards their sources, [n]."""
     return np.sum(np.cross(rays.u, rays.v) * (rays.source - rays.corner), 1) > 0
 
 

@@ -483,7 +483,8 @@ class Geometry(ABC):
         return out
 
     def bins(self, factor: int) -> tuple[int, int]:
-        """How many rows and columns make one of `binned(factor)`: `factor`, or 1 along a side of fewer than two new pixels."""
+        """Return the numbers of rows and of columns that make a row and a column of `binned(factor)`: `factor`, or 1 along a
+        side of fewer than two new pixels."""
         factor = whole_number('the binning of pixels', factor, 1)
         by_v, by_u = (factor if n >= 2 * factor else 1 for n in self.nDetector)
         return by_v, by_u

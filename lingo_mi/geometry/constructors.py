@@ -1,4 +1,4 @@
-"""What the constructors of `Geometry` do: they choose the kind of scan that the numbers make."""
+"""The work of the constructors of `Geometry`: they choose the kind of scan for the given numbers."""
 
 from __future__ import annotations
 

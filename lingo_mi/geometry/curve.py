@@ -1,4 +1,4 @@
-r"""Where the pixels of a panel that is bent on a cylinder lie on the flat panel that it touches. Pure NumPy.
+r"""Pixels of a panel that is bent on a cylinder, as positions on the flat panel that it touches. Pure NumPy.
 
 The columns of a curved panel are lines along the axis of its cylinder, evenly spaced along the arc. The panel touches a flat
 one along its middle, with the same steps u and v there. A ray that meets the curved panel at the pixel position (x, y) meets the

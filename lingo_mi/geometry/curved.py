@@ -206,7 +206,7 @@ def slid(rays: Rays, nDetector: tuple[int, int], radius: float, by: np.ndarray) 
 
 
 def curve_of(rays: Rays, nDetector: tuple[int, int], radius: float) -> Curve:
-    """How panels are bent that touch the flat ones of `rays` along their middle, mm.
+    """Return the bend of panels that touch the flat panels of `rays` along their middle, mm.
 
     Raises
     ------

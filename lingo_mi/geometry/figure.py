@@ -63,7 +63,7 @@ def figure(geometry: Geometry, views: np.ndarray) -> Figure:
 
 
 def _sources(geometry: Geometry) -> np.ndarray:
-    """Where the beams of all views are drawn from, [n, 3]: of a parallel beam, before the volume."""
+    """Return the points from which the beams of all views are drawn, [n, 3]. A parallel beam is drawn from before the volume."""
     rays = geometry.rays(curved=True)
     if geometry.mode == 'cone':
         return rays.source

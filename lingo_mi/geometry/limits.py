@@ -1,4 +1,4 @@
-"""How far the numbers of a scan may go, so that everything made of them stays finite.
+"""Limits of the numbers of a scan, so that everything made from them stays finite.
 
 Lengths, in mm or whatever unit a scan has, are zero or from 1e-12 to 1e12, and no two of a scan's are further apart than
 that: products of three, which projectors form, then fit into float32 in any frame. These are the limits of Gaussians too

@@ -198,7 +198,7 @@ class Rays:
         return (x, y) if self.curve is None else self.curve.on_panel(x, y, view)
 
     def points(self, view: int, x: ArrayLike, y: ArrayLike) -> np.ndarray:
-        """Where the pixel positions x, y of a view's panel are in space, [..., 3]."""
+        """Return the positions in space [..., 3] of the positions x, y on a view's panel."""
         start, direction = self.through(view, x, y)
         if self.parallel:
             return start
@@ -215,7 +215,8 @@ class Rays:
 
 
 def _faults(source, corner, u, v, parallel) -> Iterator[tuple[str, Any]]:
-    """What may be wrong with poses, each with the views [n] where it is; later ones count on the earlier."""
+    """Return the possible faults of poses, each with the views [n] that have it. Later faults assume that earlier ones are
+    absent."""
     far = ~(np.abs(np.concatenate([source, corner, u, v], 1)) <= MOST_LENGTH).all(1)
     yield f'holds NaN or infinity, or numbers beyond {MOST_LENGTH:.0e}', far
     normal = np.cross(u, v)

@@ -1,4 +1,4 @@
-"""How a scanner moves: the angles of a circle, the heights of a helix, and the rays of any motion in TIGRE's terms."""
+"""Motions of a scanner: the angles of a circle, the heights of a helix, and the rays of any motion in TIGRE's terms."""
 
 from __future__ import annotations
 

@@ -111,7 +111,7 @@ def _edges(nu, width):
 
 
 def _matters(levels, high):
-    """Whether a polynomial in time through a level stands out of the noise, which second differences tell."""
+    """Return whether a polynomial in time through a level stands out of the noise, which second differences measure."""
     n = len(levels)
     if n < DEGREE + 3:
         return False

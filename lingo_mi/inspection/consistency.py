@@ -1,4 +1,4 @@
-"""How well views agree with each other, without a reconstruction: data consistency conditions of the plane of the source.
+"""Agreement of views with each other, without a reconstruction: data consistency conditions of the plane of the source.
 
 Fan beam. For two sources, the line through them beside the object, and phi the angle of a ray to the line's normal,
 

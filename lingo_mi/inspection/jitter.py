@@ -1,4 +1,4 @@
-"""How unsteadily the object's outline moves from view to view: by third differences, in which smooth motion cancels."""
+"""Unsteadiness of the object's outline from view to view: third differences, in which smooth motion cancels."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a scan says of itself: numbers, and which of them call for a correction. Nothing is changed."""
+"""Measurements of a scan's errors, and which of them call for a correction. Nothing is changed."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ Obstacle = Literal['orbit', 'panel', 'gaps', 'truncation', 'empty', 'aside']
 
 @dataclass(frozen=True)
 class Border:
-    """What the pixels at the edges of the panel show.
+    """Measurements of the pixels at the edges of the panel.
 
     Attributes
     ----------
@@ -63,7 +63,7 @@ class Border:
 
 @dataclass(frozen=True)
 class Orbit:
-    """What the views say of angles, order and axis; by default, nothing was measured.
+    """Measurements of angles, order and axis from the views; the defaults stand for no measurement.
 
     Attributes
     ----------
@@ -100,13 +100,13 @@ class Orbit:
 
     @property
     def short(self) -> bool:
-        """Whether the views span too little to measure the axis."""
+        """True if the views span too little to measure the axis."""
         return self.turn is not None and np.degrees(self.turn) < HALF_TURN
 
 
 @dataclass(frozen=True)
 class Findings:
-    """What `measure` has measured.
+    """Result of `measure`.
 
     Attributes
     ----------
@@ -171,7 +171,7 @@ class Findings:
 
     @property
     def misplaced(self) -> bool:
-        """Whether angles, order or distances are wrong."""
+        """True if angles, order or distances are wrong."""
         o = self.orbit
         return bool(
             self.text_order is not None or self.wide or o.turn == 0 or o.unit or o.reversed is not None or o.off_axis
@@ -184,7 +184,7 @@ class Findings:
 
     @property
     def air_differs(self) -> bool:
-        """Whether the views have different air levels, or air that slopes differently."""
+        """True if the views have different air levels, or air that slopes differently."""
         if self.air is not None and self.air.levels.std(0).max() > UNSTEADY_AIR * self.high:
             return True
         spread = self.border and self.border.air_spread
@@ -196,7 +196,7 @@ class Findings:
 
     @property
     def unsteady(self) -> bool:
-        """Whether the object or the panel moves from view to view."""
+        """True if the object or the panel moves from view to view."""
         return any(x > UNSTEADY for x in self.jitter)
 
 

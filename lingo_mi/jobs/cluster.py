@@ -162,7 +162,7 @@ class Cluster:
 
 
 def _gone() -> tuple[type[BaseException], ...]:
-    """What a client raises whose scheduler does not answer any more."""
+    """Return the exceptions that a client raises if its scheduler no longer answers."""
     from distributed.client import FutureCancelledError
     from distributed.comm.core import CommClosedError
 
@@ -196,7 +196,7 @@ def _follow(jobs: dict[str, Job], events: queue.SimpleQueue, tell: Tell, bar: Pr
 
 
 def _end(name: str, future: Any) -> Event:
-    """How a task ended. A worker's death is not an error of a job until several have died of it."""
+    """Describe the end of a task. A worker's death is an error of a job only after several workers have died of it."""
     if future.status == 'finished':
         event = Event(*future.result())
         return event if event.kind != 'stopped' else Event(name, 'failed', 'was cancelled on its worker')

@@ -34,7 +34,7 @@ class Job:
 
 
 class Event(NamedTuple):
-    """What is told of a job.
+    """Message about a job.
 
     Parameters
     ----------

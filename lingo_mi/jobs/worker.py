@@ -1,4 +1,4 @@
-"""What a worker of a cluster does with a job."""
+"""The part of a job that runs on a worker of a cluster."""
 
 from __future__ import annotations
 

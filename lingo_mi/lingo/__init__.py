@@ -1,1 +1,1 @@
-"""What section III of the paper says: masks, the filter of all views, voxel scaling, mean pixel, loss scale."""
+"""Section III of the paper: masks, the filter of all views, voxel scaling, mean pixel, loss scale."""

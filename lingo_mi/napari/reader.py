@@ -1,4 +1,4 @@
-"""What napari opens: volumes, clouds, projections, and the folder of a result, as layers in mm."""
+"""The reader of napari: volumes, clouds, projections, and the folder of a result, as layers in mm."""
 
 from __future__ import annotations
 

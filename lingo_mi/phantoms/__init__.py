@@ -46,7 +46,7 @@ class Scaled:
     factor: float
 
     def project(self, geometry: Geometry) -> np.ndarray:
-        """As `Analytic.project`."""
+        """Project like `Analytic.project`."""
         return self.analytic.project(geometry) * np.float32(self.factor)
 
 

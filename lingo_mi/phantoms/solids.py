@@ -330,7 +330,7 @@ class Texture:
 
 @dataclass(frozen=True)
 class Branching:
-    """What all branches of a random tree share.
+    """Properties that all branches of a random tree share.
 
     Parameters
     ----------

@@ -59,7 +59,7 @@ class Discs:
 
     @property
     def visible(self) -> Any:
-        """Whether a Gaussian touches the image, Bool [N]."""
+        """True if a Gaussian touches the image, Bool [N]."""
         return self.count[0] * self.count[1] > 0
 
 
@@ -207,7 +207,7 @@ class _Lists:
 
 
 class _Place:
-    """Where the lanes of all tiles are: four pixels of a row each, and the range of their tile's list."""
+    """Positions of the lanes of all tiles: four pixels of a row each, and the range of their tile's list."""
 
     def __init__(self, lists, width, height):
         lane = dr.arange(mi.UInt32, lists.tiles * LANES)

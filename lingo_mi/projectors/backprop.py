@@ -52,7 +52,7 @@ class Cuts:
         return copies
 
     def pass_on(self, values: Iterable, gradients: Iterable, flags: Any = dr.ADFlag.Default) -> None:
-        """As the function `pass_on`, through all parts."""
+        """Pass on derivatives through all parts, like the function `pass_on`."""
         keep = dr.ADFlag.ClearVertices  # parts may share the graph of what comes before them
         pass_on(values, gradients, keep if self.parts else flags)
         while self.parts:

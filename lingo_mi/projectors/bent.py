@@ -1,4 +1,4 @@
-"""Where the pixels of curved panels lie on the flat ones that they touch, on the device (Dr.Jit): see `geometry.curve`.
+"""Pixels of curved panels as positions on the flat panels that they touch, on the device (Dr.Jit): see `geometry.curve`.
 
 A ray through a pixel of a curved panel is the ray through (X, Y) of the flat one, so the projectors of voxels need no more. The
 splat of Gaussians works along straight lines of equally spaced pixels, which are the columns of a curved panel (`Bend`).
@@ -78,7 +78,7 @@ def column_of(numbers: list[Any], x: Any) -> Any:
 
 @dataclass
 class Bend:
-    """How the panel of one view is bent.
+    """Bend of the panel of one view.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How many items overlap, and how many partial sums they need.
+"""Numbers of overlapping items, and of the partial sums that they need.
 
 Adding n equal numbers one by one in float32 leaves a relative error of about n 8e-9; of n 2e-9 on the CPU, where the teams'
 images share them. If more than `deep` items lie at one place, they are therefore added into several partial sums, and these are

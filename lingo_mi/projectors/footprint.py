@@ -88,7 +88,7 @@ class Footprints:
 
     @property
     def visible(self) -> Any:
-        """Whether a Gaussian has pixels in the image, Bool [N]."""
+        """True if a Gaussian has pixels in the image, Bool [N]."""
         return self.row_end > self.row_begin
 
 

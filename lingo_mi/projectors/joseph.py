@@ -84,7 +84,7 @@ def row_table(geometry: Geometry) -> np.ndarray:
 
 
 def _is_upright(geometry: Geometry) -> bool:
-    """Whether every view's columns are parallel to z and its rows, and a parallel beam, perpendicular to it."""
+    """Return whether every view's columns are parallel to z and its rows, and a parallel beam, perpendicular to it."""
     rays, (n_v, n_u) = geometry.rays(curved=True), geometry.nDetector
     pixel = np.minimum(np.linalg.norm(rays.u, axis=1), np.linalg.norm(rays.v, axis=1))
     off = np.abs(rays.u[:, 2]) * n_u + np.linalg.norm(rays.v[:, :2], axis=1) * n_v
@@ -150,7 +150,8 @@ class Joseph(Gathered):
 
     @classmethod
     def serves(cls, geometry: Geometry) -> bool:
-        """Whether it can project a scan: an upright panel, and all of the volume well before the source."""
+        """Return whether this projector can project a scan: the panel must be upright, and all of the volume well before the
+        source."""
         return _is_upright(geometry) and _rows_of_voxel(geometry) <= max(MOST_ROWS, 2 * geometry.nDetector[0])
 
     def of_slab(self, slab: Geometry) -> Joseph:

@@ -43,7 +43,7 @@ def find_objects(scene: mi.Scene) -> list:
 
 
 def _objects(shape: mi.Shape, scene: mi.Scene) -> list:
-    """What attenuates in a shape; an instance has what its group has, moved."""
+    """Return the objects of a shape that attenuate. An instance has the objects of its group, moved."""
     if shape.class_name() != 'Instance':
         obj = _object(shape)
         return [] if obj is None else [obj]
@@ -120,7 +120,7 @@ class Ellipsoids:
 
 
 def _holds(volume, tensor) -> bool:
-    """Whether a volume of Mitsuba has these values: an albedo may be a grid, too."""
+    """Return whether a volume of Mitsuba has these values. An albedo may be a grid, too."""
     data: Any = dict(mi.traverse(volume)).get('data')
     return data is not None and data.array.index == tensor.array.index
 
@@ -179,7 +179,7 @@ def _no_area(options):
 
 
 def _axis_aligned(cube, volume) -> bool:
-    """Whether cube and gridvolume are axis-aligned and the volume is not mirrored. Bounding boxes do not show this."""
+    """Return whether cube and gridvolume are axis-aligned and the volume is not mirrored. Bounding boxes do not show this."""
     corners = np.array(mi.traverse(cube)['vertex_positions']).reshape(-1, 3)
     low, high = corners.min(0), corners.max(0)
     off_corner = np.minimum(corners - low, high - corners)

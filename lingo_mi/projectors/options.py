@@ -1,4 +1,4 @@
-"""How line integrals are computed: the cut-off, the model of a footprint, the rule for a pixel."""
+"""Options of line integrals: the cut-off, the model of a footprint, the rule for a pixel."""
 
 from __future__ import annotations
 

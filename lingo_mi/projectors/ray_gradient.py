@@ -1,4 +1,4 @@
-r"""How line integrals of voxels change with the rays (Dr.Jit, llvm or cuda).
+r"""Derivatives of line integrals of voxels with respect to the rays (Dr.Jit, llvm or cuda).
 
 A sample of a volume f at the point p moves by :math:`\nabla f \cdot \delta p`. The models of `grid` and of `joseph` and
 `tilted_joseph` are sums of samples, so what is needed of the volume are a few sums along each ray:

@@ -204,7 +204,7 @@ class _Item:
         return mi.Float(y - self.row)
 
     def on_ridge(self, n):
-        """Where t is 0 in a row at that distance: a column and a fraction."""
+        """Return the place where t is 0 in a row at that distance: a column and a fraction."""
         along, along_low = times(self.shear, self.shear_low, n)
         steps = whole(along - self.ridge)
         # Near the ridge t needs all its digits; there these differences are exact.

@@ -101,7 +101,7 @@ class Stack:
         return out
 
     def used(self, view: Any, u: Any, v: Any) -> Any:
-        """Whether pixels are valid."""
+        """Return whether pixels are valid."""
         if self.valid is None:
             return mi.Bool(True)
         return dr.gather(mi.Float, self.valid, (view * self.panel[1] + u) * self.panel[0] + v) > 0

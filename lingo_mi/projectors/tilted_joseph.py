@@ -65,7 +65,8 @@ class TiltedJoseph(Gathered):
 
     @classmethod
     def serves(cls, geometry: Geometry) -> bool:
-        """Whether it can project a scan: all of the volume, and a voxel around it, must lie before the source."""
+        """Return whether this projector can project a scan: all of the volume, and a voxel around it, must lie before the
+        source."""
         if geometry.mode == 'parallel':
             return True
         rays, half = geometry.rays(curved=True), np.array(geometry.grid.size) / 2 + geometry.grid.spacing
@@ -181,7 +182,8 @@ def _integrate(data, size, ray: Ray):
 
 
 def _shadow(r, point) -> Any:
-    """Where rays that pass within a voxel of `point` in its slice meet the (flat) panel, along u and v: shadows as for `_pixels`.
+    """Return where the rays that pass within a voxel of `point` in its slice meet the (flat) panel along u and v: shadows as
+    for `_pixels`.
 
     A shift by s moves the shadow along u by (p - u w) s / (w0 + w s), with p and w rows of the projection matrix r and w0 the
     point's value of w. One entry of s, that along the main axis, is zero.

@@ -16,7 +16,7 @@ SAFE_ASPECT = 1e6
 
 
 def require_usable(centre: Any, scale: Any, rotation: Any, density: Any, where: str) -> bool:
-    """Whether all Gaussians of a cloud can be integrated accurately. Waits for the device.
+    """Return whether all Gaussians of a cloud can be integrated accurately. Waits for the device.
 
     Warns with AccuracyWarning and returns False if a Gaussian can be integrated, but not accurately.
 

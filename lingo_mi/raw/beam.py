@@ -15,7 +15,7 @@ from lingo_mi.raw.recording import Frames
 
 @dataclass(frozen=True)
 class Beam:
-    """What line integrals are relative to.
+    """Reference of line integrals: the open beam.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Beam:
         darks: Frames | None,
         white: float | None,
     ) -> Beam:
-        """As options ask for. `path` is named in errors; `white` is Nikon's white level.
+        """Make the beam that the options ask for. `path` is named in errors; `white` is Nikon's white level.
 
         Raises
         ------

@@ -23,7 +23,7 @@ _PREAMBLE = 128  # bytes before the letters DICM
 
 @dataclass(frozen=True)
 class _Kind:
-    """What is known of a kind of projections.
+    """Properties of a kind of projections.
 
     numbers(file, header): what is kept of a header, small, as a scan may have 50 000 files.
     values(numbers, pixels): counts, or shares of the unattenuated beam, of stored pixels.
@@ -41,7 +41,7 @@ _XA = _Kind(dicom_xa.numbers, dicom_xa.counts, dicom_xa.taken, False)
 
 
 def is_dicom(path: Path) -> bool:
-    """Whether a file is in DICOM's format, by its suffix or its first bytes: scanners often write no suffix."""
+    """Return whether a file is in DICOM's format, by its suffix or its first bytes: scanners often write no suffix."""
     if path.suffix.lower() in SUFFIXES:
         return True
     if not path.is_file() or path.name.upper() == 'DICOMDIR':  # the index of a disk

@@ -64,12 +64,12 @@ class _View:
 
 
 def is_projection(header: Any) -> bool:
-    """Whether such a file has this DICOM header."""
+    """Return whether such a file has this DICOM header."""
     return any(tag in header for _, tag in ATTRIBUTES.values())
 
 
 def numbers(file: Path, header: Any) -> _View:
-    """What is needed of a header: see `lingo_mi.raw.dicom`.
+    """Return the numbers of a header that an import needs: see `lingo_mi.raw.dicom`.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a DICOM header says, for geometries: a value, or the one line that names what is missing."""
+"""The content of a DICOM header for geometries: a value, or the one line that names what is missing."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class _Run:
 
 
 def numbers(file: Path, header: Any) -> _Run:
-    """What is needed of a header: see `lingo_mi.raw.dicom`.
+    """Return the numbers of a header that an import needs: see `lingo_mi.raw.dicom`.
 
     Raises
     ------

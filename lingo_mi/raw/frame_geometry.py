@@ -33,7 +33,7 @@ GEOMETRY_FILES = ', '.join(('.yml', *SCANNER_FILES, '.xml (RTK)'))
 
 
 def has_grid(geometry: PathLike | str | Geometry | None) -> bool:
-    """Whether a geometry gives the number of voxels. If not, `grid_in_view` makes the grid."""
+    """Return whether a geometry gives the number of voxels. If not, `grid_in_view` makes the grid."""
     if isinstance(geometry, Geometry):
         return True
     if geometry is None or Path(geometry).suffix.lower() not in ('.yml', '.yaml'):
@@ -42,7 +42,7 @@ def has_grid(geometry: PathLike | str | Geometry | None) -> bool:
 
 
 def _same(nDetector, shape):
-    """Whether a geometry file's nDetector, two numbers or one for both, is this shape."""
+    """Return whether a geometry file's nDetector, two numbers or one for both, is this shape."""
     try:
         return np.array_equal(np.broadcast_to(nDetector, 2), shape)
     except ValueError:  # of another length, or lists of several

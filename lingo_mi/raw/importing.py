@@ -122,7 +122,7 @@ def import_raw(
 
 
 def _full_range(count):
-    """Whether a count is the highest one of a converter of 8 bits or more."""
+    """Return whether a count is the highest one of a converter of 8 bits or more."""
     return count >= 255 and float(np.log2(count + 1)).is_integer()
 
 

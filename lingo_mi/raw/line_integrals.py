@@ -27,7 +27,7 @@ HOT = 0.05  # and one whose dark count is that part of the flat's counts off its
 
 @dataclass(frozen=True)
 class Fields:
-    """What the panel shows without an object.
+    """Images of the panel without an object.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ class Fields:
     photons: float | None
 
     def part(self, region: Callable[[np.ndarray], np.ndarray]) -> Fields:
-        """What `region` keeps of each image."""
+        """Return the part of each image that `region` keeps."""
         flat = None if self.flat is None else region(self.flat)
         return replace(self, dark=region(self.dark), flat=flat, good=region(self.good))
 
@@ -112,7 +112,7 @@ def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None, s
 
 
 def _near(dark, signal):
-    """Where dark counts are like their neighbours'."""
+    """Return the mask of the pixels whose dark counts are like their neighbours'."""
     off = np.abs(dark - median_filter(dark, 5))
     return off <= np.maximum(HOT * np.median(signal), 12 * 1.4826 * np.median(off) + 1)
 

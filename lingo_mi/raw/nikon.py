@@ -78,7 +78,7 @@ def read_numbers(path: PathLike | str) -> np.ndarray:
 
 
 def _decimal_commas(lines):
-    """Whether commas are decimal: they stand beside another separator, or after something that does not count views."""
+    """Return whether commas are decimal: they stand beside another separator, or after something that does not count views."""
     rows = [re.split(r'[\s;:]+', line.strip()) for line in lines if re.match(r'\s*[-+]?\d', line)]
     if any(re.fullmatch(r'[-+]?\d+,\d+', cell) for row in rows for cell in row[1:2]):
         return True

@@ -1,4 +1,4 @@
-"""What is asked of an import: `Options`, and its values that depend on the frames."""
+"""Options of an import: `Options`, and its values that depend on the frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from lingo_mi.common.parsing import checked, whole_number
 
 @dataclass(frozen=True)
 class Options:
-    """How frames become line integrals.
+    """Options that turn frames into line integrals.
 
     Parameters
     ----------

@@ -70,7 +70,7 @@ class Frames:
 
 @dataclass(frozen=True)
 class Taken:
-    """Where whole frames were taken, as a scanner's own file says it.
+    """Geometry of whole frames from a scanner's own file.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class Taken:
 
 @dataclass(frozen=True)
 class Recording:
-    """What one file or folder holds: the views, and what else it may say.
+    """Content of one file or folder: the views, and any further data that it has.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ class Recording:
 
 
 def checked(path: PathLike | str, read: Callable[[], Any]) -> Any:
-    """What `read` gives, with an InputError for whatever a damaged file or folder `path` does."""
+    """Return the result of `read`, and raise an InputError for any error that a damaged file or folder `path` causes."""
     try:
         with reading(path, Path(path).is_dir()):
             return read()

@@ -21,7 +21,7 @@ LEAST_COLUMNS = 256  # on fewer, a body's details are as narrow as the curve: a 
 
 
 def ring_offsets(projections: np.ndarray, valid: np.ndarray | None = None) -> np.ndarray:
-    """What each pixel adds to its line integrals in all views, float32 [v, u]; to be subtracted.
+    """Return the value that each pixel adds to its line integrals in all views, float32 [v, u]. It is to be subtracted.
 
     Parameters
     ----------

@@ -200,7 +200,7 @@ class ASDPOCS(Algorithm):
         return swept(scan, self.plan(scan), thickness, as_path('folder', folder), progress)
 
     def plan(self, scan: Scan) -> DescentPlan:
-        """What is done with the volume in slabs.
+        """Return the plan by which the volume is made in slabs.
 
         Raises
         ------
@@ -223,7 +223,7 @@ class ASDPOCS(Algorithm):
         return step * self.alpha_red if changes.descent > self.rmax * changes.data and unmatched() else step
 
     def ends(self, lmbda: float, changes: Changes, unmatched: Callable[[], bool]) -> bool:
-        """Whether a pass is the last one. lmbda: of the next one."""
+        """Return whether a pass is the last one. lmbda is the rate of the next pass."""
         cosine = changes.product / max(changes.data * changes.descent, 1e-30)
         return (cosine < -0.99 and not unmatched()) or lmbda < LMBDA_MIN
 

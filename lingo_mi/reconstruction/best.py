@@ -406,7 +406,8 @@ def _best(refinements: Sequence[Trial]) -> Trial:
 
 
 def error_map(volume: np.ndarray, fewer: np.ndarray) -> np.ndarray:
-    """Where a volume is uncertain: its difference from a volume of fewer views, root mean square around each voxel.
+    """Return a map of the uncertainty of a volume: its difference from a volume of fewer views, root mean square around each
+    voxel.
 
     Both volumes and the result are float32 [x, y, z], density per mm. The map ranks the voxels. It does not tell the size of the
     error, because both volumes lack what no view shows.

@@ -54,7 +54,7 @@ def split_views(scan: Scan, every: int) -> tuple[Scan, Scan]:
 
 
 def held_out_views(count: int, every: int) -> np.ndarray:
-    """Which of `count` views, at least four, are held out."""
+    """Return the indices of the views that are held out of `count` views, at least four."""
     every = min(every, count - 1)
     return np.arange(every // 2, count - 1, every)
 

@@ -60,7 +60,7 @@ def rectified(scan: Scan, what: str = 'an upright panel') -> Scan:
 
 
 def can_rectify(scan: Scan) -> bool:
-    """Whether `rectified` accepts the scan: all pixels valid, the source on a circle, the panel moving with it."""
+    """Return whether `rectified` accepts the scan: all pixels valid, the source on a circle, the panel moving with it."""
     try:
         require_pixels(scan, '')
         rectified_geometry(scan.geometry)

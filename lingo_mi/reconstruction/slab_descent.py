@@ -42,7 +42,7 @@ class Changes(NamedTuple):
 
 
 class Balance(Protocol):
-    """What ASD-POCS decides, by its options; see `asd_pocs.ASDPOCS`."""
+    """The decisions of ASD-POCS by its options; see `asd_pocs.ASDPOCS`."""
 
     @property
     def niter(self) -> int: ...
@@ -178,7 +178,7 @@ def _distance(system: SlabSystem, scan: Scan, ax: Images) -> float:
 
 
 class DescentSystem(SlabSystem):
-    """What ASD-POCS does with a slab besides the sweeps."""
+    """The work of ASD-POCS on a slab besides the sweeps."""
 
     def backproject(self, part: int, filtered: FilteredViews) -> None:
         """Write a slab of filtered backprojection where the next version will lie."""

@@ -51,7 +51,7 @@ class Share(Protocol):
     """Does the same work for every slab of a volume, here or elsewhere."""
 
     def __call__(self, work: str, *arguments: Any, slab_done: Callable[[], object] = lambda: None) -> Iterable[Any]:
-        """What `SlabSystem.work(part, *arguments)` returns of each slab, from the first on: an array, or None.
+        """Return the result of `SlabSystem.work(part, *arguments)` for each slab, from the first on: an array, or None.
 
         Parameters
         ----------
@@ -83,11 +83,11 @@ class SweepPlan:
     files: ClassVar[int] = 2
 
     def system(self, geometry: Geometry, valid: np.ndarray | None, volume: SlabFiles) -> SlabSystem:
-        """What does the work on the slabs."""
+        """Return the system that works on the slabs."""
         return SlabSystem(geometry, valid, volume)
 
     def place(self, done: int) -> Places:
-        """Where the versions lie after so many."""
+        """Return the places of the versions after so many sweeps."""
         return Places(done % 2 if done else None, (done + 1) % 2)
 
     def digest(self, scan: Scan, thickness: int) -> str:
@@ -333,7 +333,7 @@ class SlabSystem:
         return A, evaluated(A.adjoint(error, views, between_zeros))
 
     def _margins(self, part):
-        """How many slices of zeros lie below and above a slab."""
+        """Return the numbers of slices of zeros below and above a slab."""
         begin, end = self.volume.parts[part]
         return int(begin > 0), int(end < self.geometry.grid.shape[2])
 

@@ -1,4 +1,4 @@
-"""What a voxel's number means: the mean over its cube, or the value at its centre (NumPy and SciPy).
+"""The meaning of a voxel's number: the mean over its cube, or the value at its centre (NumPy and SciPy).
 
 A projector reads numbers as values at the centres, between which it interpolates linearly. The mean of that function over a
 voxel's cube is a weighted mean B of the value and its neighbours', 1/8, 3/4, 1/8 along each axis. Means over smaller voxels, read

@@ -28,7 +28,7 @@ def pitch(geometry: Geometry) -> tuple[float, float, float]:
 
 
 def leave_voxels_out(geometry: Geometry) -> bool:
-    """Whether rays are so far apart that voxels lie between them."""
+    """Return whether rays are so far apart that voxels lie between them."""
     return max(pitch(geometry)) >= 2
 
 

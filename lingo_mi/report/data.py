@@ -1,4 +1,4 @@
-"""What a report shows, checked: numbers, volume, views, cloud, scanner."""
+"""The content of a report, checked: numbers, volume, views, cloud, scanner."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ REAL, X3D = 'density [1/mm]', "density [X3D's scale, 0 to 1]"
 
 
 def quantity_of(volume: np.ndarray, spacing: ArrayLike) -> str:
-    """What a volume [x, y, z] holds: attenuation per mm, or densities on X3D's scale, which no scanner could measure."""
+    """Return the quantity of a volume [x, y, z]: attenuation per mm, or densities on X3D's scale, which no scanner could
+    measure."""
     along = [float(volume.sum(i, dtype=float).max() * step) for i, step in enumerate(np.asarray(spacing))]
     return REAL if max(along) < OPAQUE else X3D
 
@@ -78,13 +79,13 @@ class ReportData:
 
     @cached_property
     def quantity(self) -> str:
-        """What the volume holds, with its unit: see `quantity_of`."""
+        """The quantity of the volume with its unit: see `quantity_of`."""
         volume = self.volume if self.truth is None else self.truth
         return REAL if volume is None else quantity_of(volume, self.preview * np.asarray(self.spacing))
 
     @property
     def reference(self) -> str:
-        """What the views are that the rendered ones are compared with: those of a known object are simulated, as a rule."""
+        """The label of the views that rendered views are compared with. Views of a known object are usually simulated."""
         return 'Measured' if self.truth is None and self.quantity == REAL else 'Reference'
 
     def __post_init__(self):

@@ -9,7 +9,7 @@ import numpy as np
 
 
 class Number(NamedTuple):
-    """How a number is shown: its label, unit, format, and what it says."""
+    """Presentation of a number: its label, unit, format and meaning."""
 
     label: str
     unit: str
@@ -130,7 +130,7 @@ def headline(metrics: dict) -> str:
 
 
 def has_value(value: object) -> bool:
-    """Whether there is something to show: neither None nor NaN."""
+    """Return whether there is something to show: neither None nor NaN."""
     return not (value is None or isinstance(value, (float, np.floating)) and math.isnan(value))
 
 

@@ -29,7 +29,7 @@ class Packed:
     text: str
 
     def head(self) -> dict:
-        """What the page needs to know beside the text."""
+        """Return the data that the page needs beside the text."""
         return dict(shape=list(self.shape), low=self.low, step=self.step)
 
 

@@ -1,4 +1,4 @@
-"""What a page holds of a result: arrays, packed, and what its scripts need to know beside them."""
+"""The content of a result's page: packed arrays, and the data that its scripts need beside them."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MAP_BITS = 8  # of a map of errors, which ranks voxels: no more than its colours
 
 
 def payload(data: ReportData, surfaces: bool = True, earlier: Arrays | None = None) -> tuple[dict, Arrays]:
-    """What the scripts know of a report beside colours and history, and its arrays by name.
+    """Return the data of a report for the scripts, besides colours and history, and its arrays by name.
 
     Parameters
     ----------

@@ -1,4 +1,5 @@
-"""What pictures and pages show of a volume and of a history: slices, their places, their grey scale, curves. Pure functions."""
+"""The content of pictures and pages about a volume and a history: slices, their places, their grey scale, curves. Pure
+functions."""
 
 from __future__ import annotations
 

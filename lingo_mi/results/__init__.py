@@ -1,1 +1,1 @@
-"""What is shown of fits: a page and a log that grow while one runs, and a page of several side by side."""
+"""Observers of fits: a page and a log that grow during a fit, and a page that compares several fits."""

@@ -156,7 +156,7 @@ class Live:
     # ---- of the server's threads ----
 
     def allowed(self, host: str, token: str) -> bool:
-        """Whether a request is for this server by its own name, and knows its token."""
+        """Return whether a request has this server's own name and its token."""
         names = {f'127.0.0.1:{self._port}', f'localhost:{self._port}'}
         return host in names and hmac.compare_digest(token.encode(), self._token.encode())
 
@@ -166,7 +166,7 @@ class Live:
         return template.page(self.title, 'a fit that is running', '', '', content, Arrays(), live=True)
 
     def state(self, seen: int, place: str) -> dict:
-        """What a page does not know yet.
+        """Return the data that a page does not have yet.
 
         Parameters
         ----------

@@ -68,12 +68,12 @@ def load_scene(path: PathLike | str, parameters: dict | None = None, slab: int =
 
 
 def load_file(path: Path, parameters: dict | None = None) -> Any:
-    """What Mitsuba makes of a scene file.
+    """Load a scene file with Mitsuba.
 
     Raises
     ------
     InputError
-        In one line, for whatever it finds wrong, and keyboardinterrupt after ctrl-c, also within a plugin.
+        In one line, for whatever it finds wrong, and KeyboardInterrupt after Ctrl-C, also within a plugin.
     """
     try:
         str(path).encode('utf-8')

@@ -62,7 +62,7 @@ def outline(path: PathLike | str, parameters: dict | None = None) -> set[str]:
 
 @dataclass
 class _Reader:
-    """What is known after a part of the files.
+    """State of the reader after a part of the files.
 
     Parameters
     ----------

@@ -28,7 +28,7 @@ def true_volume(objects: Iterable, grid: Grid) -> np.ndarray | None:
 
 
 def fills_grid(obj: GridInCube, grid: Grid) -> bool:
-    """Whether an object's grid is the scanner's own."""
+    """Return whether an object's grid is the scanner's grid."""
     near = 1e-4 * max(grid.size) / 2
     return (
         tuple(obj.size) == grid.shape

@@ -64,7 +64,7 @@ _LEFTOVER = re.compile(r'\.lingo_mi-[0-9a-f]{16}-(.*)', re.DOTALL)
 
 
 def parsed_json(text: str | bytes) -> Any:
-    """What a text in JSON says.
+    """Parse a text in JSON.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def parsed_json(text: str | bytes) -> Any:
 
 
 def read_json(path: PathLike | str) -> Any:
-    """What a JSON file says; None if it is not JSON.
+    """Read a JSON file; return None if it is not JSON.
 
     Raises
     ------
@@ -94,7 +94,7 @@ def read_json(path: PathLike | str) -> Any:
 
 
 def read_object(path: PathLike | str) -> dict[str, Any]:
-    """What a JSON file holds by name.
+    """Read the object in a JSON file.
 
     Raises
     ------

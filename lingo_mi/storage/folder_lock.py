@@ -89,7 +89,7 @@ def _take(path: Path, stack: ExitStack) -> None:
 
 
 def _hold(file: int) -> bool | None:
-    """Whether the system gives this process the lock; None if it has no such locks."""
+    """Return whether the system gives this process the lock; None if it has no such locks."""
     try:
         if fcntl is None:
             return None
@@ -113,7 +113,7 @@ def _open(path: Path) -> tuple[int, bool]:
 
 
 def _same(path: Path, file: int) -> bool:
-    """Whether the open file still has this name."""
+    """Return whether the open file still has this name."""
     try:
         return os.path.samestat(os.lstat(path), os.fstat(file))
     except FileNotFoundError:
@@ -127,7 +127,7 @@ def _name_owner(file: int) -> None:
 
 
 def _owner(file: int) -> dict:
-    """Who has written the lock file; raises InputError if it is another program's file."""
+    """Return the process that wrote the lock file; raise InputError if it is another program's file."""
     os.lseek(file, 0, os.SEEK_SET)
     content = os.read(file, 4096)
     if not content:  # just made, or its owner was killed then
@@ -142,7 +142,7 @@ def _owner(file: int) -> dict:
 
 
 def _alive(owner: dict) -> bool:
-    """Whether the owner may still be running: known for processes of this computer only."""
+    """Return whether the owner may still be running. This is known only for processes of this computer."""
     if not owner or owner['host'] != socket.gethostname():
         return True
     try:

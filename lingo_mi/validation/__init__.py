@@ -1,4 +1,4 @@
-"""What users check the package with: derivatives, accuracy, speed, and the paper's tables. The library needs none of it.
+"""Checks for users: derivatives, accuracy, speed, and the paper's tables. The library does not need them.
 
 What is measured, each by a command of `lingo_mi.cli`:
 

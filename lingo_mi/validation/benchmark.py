@@ -43,7 +43,7 @@ TREE = 'bvh_forward_ms', 'bvh_backward_ms', 'bvh_image_error', 'bvh_gradient_err
 
 @dataclass(frozen=True)
 class Work:
-    """What is rendered, and how often.
+    """Task of a benchmark, and its repetitions.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ def run_limit(program: Path, count: int, half: float) -> list[float]:
 
 
 def describe_times(result: dict, repeats: int) -> str:
-    """What `Bench.times` found, as lines of text."""
+    """Describe the result of `Bench.times` as lines of text."""
     lines = [
         f'{result["variant"]}, {result["gaussians"]} Gaussians, {result["pixels"]} x {result["pixels"]} pixels, '
         f'cut-off {result["extent"]:g} sigma, {result["pairs"] / 1e6:.1f} M pairs; medians of {repeats} turns'
@@ -244,7 +244,7 @@ def describe_times(result: dict, repeats: int) -> str:
 
 
 def describe_tree(result: dict) -> str:
-    """What `Bench.against_tree` found, beside what `Bench.times` did, as lines of text."""
+    """Describe the result of `Bench.against_tree` beside the result of `Bench.times`, as lines of text."""
     forward, backward = (result[f'bvh_{name}_ms'] for name in PASSES)
     return '\n'.join(
         [

@@ -119,7 +119,7 @@ def check_gradients(scene: Any, step: float = 1e-4, count: int = 4, seed: int = 
     rays = *pose.rays(), pose.begin
 
     def loss(values):
-        """That of one Gaussian alone, (centre, scale, quaternion, density)."""
+        """Compute the loss of one Gaussian alone, (centre, scale, quaternion, density)."""
         return slope @ gaussian_integral((values[:3], values[3:6], values[6:10], values[10]), *rays)
 
     def image():

@@ -99,7 +99,7 @@ class Pose:
 
     @property
     def begin(self) -> float:
-        """Where integrals begin, in t: at a cone beam's source, where t is 0."""
+        """The t at which integrals begin: 0 at a cone beam's source, else minus infinity."""
         return -np.inf if self.parallel else 0.0
 
     def rays(self) -> tuple[np.ndarray, np.ndarray]:

@@ -23,7 +23,7 @@ def command() -> str:
 
 
 def provenance(of: str | None = None) -> dict:
-    """How what is measured now is made.
+    """Return the provenance of the numbers that are measured now.
 
     - `command`: the command line
     - `commit`: the commit of the checkout that `lingo_mi` runs from, with '+' if its files have changed; None if it is

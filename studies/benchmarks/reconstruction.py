@@ -76,7 +76,7 @@ def measure(size: int, views: int, repeats: int, tilt: float = 0.0, say: Callabl
 
 
 def describe(result: dict) -> Iterator[str]:
-    """What `measure` found, line by line."""
+    """Describe the result of `measure` line by line."""
     side = result['size']
     yield (
         f'{side}^3 voxels, {result["views"]} views of {side} x {side} pixels, tilted by {result["tilt"]:g} degrees, '

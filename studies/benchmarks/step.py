@@ -1,4 +1,4 @@
-"""Where the time of a step of a fit goes.
+"""Time of the parts of a fit's step.
 
 Steps from the end of a fit, on views with random pixels. The parts of the loss are switched off one by one: what a step then
 saves is their time. All kinds of work run in turns on the same view, so that all see the same machine; medians over the turns, of

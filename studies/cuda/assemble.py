@@ -18,7 +18,7 @@ from lingo_mi.common.errors import InputError
 
 @dataclass(frozen=True)
 class Kernel:
-    """What the assembler makes of one entry of a module.
+    """Result of assembling one entry of a module.
 
     Parameters
     ----------
@@ -48,12 +48,12 @@ class Kernel:
 
     @property
     def ours(self) -> bool:
-        """Whether it is compiled from a program's operations; Dr.Jit's own, such as matrix products, are fixed."""
+        """True if it is compiled from a program's operations. Dr.Jit's own kernels, such as matrix products, are fixed."""
         return self.name.startswith('drjit_')
 
     @property
     def fails(self) -> bool:
-        """Whether it does not assemble, or spills and could be written otherwise."""
+        """True if it does not assemble, or spills and could be written otherwise."""
         return self.error is not None or self.ours and self.spilled > 0
 
 

@@ -25,7 +25,7 @@ SECTORS = {'l': 'loads', 's': 'stores', 'a': 'atomics'}
 
 
 def profiled(stand_in: str, *arguments: str) -> tuple[str, dict]:
-    """What `work` prints, and the counts of all kernels that it launches, by name.
+    """Return the output of `work`, and the counts of all kernels that it launches, by name.
 
     A kernel's counts: launches; `warp`: instructions of warps by kind; `lanes`: their lanes at work, summed; sectors by kind.
     """

@@ -43,7 +43,7 @@ ANY = 'any'  # the case of cells that hold on every device
 
 @dataclass
 class Outcome:
-    """What the tests came to.
+    """Outcome of the tests.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""How often a step of a fit waits for the GPU, copies, loads kernels and launches them.
+"""Counts of a fit's step: waits for the GPU, copies, loads of kernels and launches.
 
     python -m studies.cuda.waits PROGRAM out/chest/checkpoint.npz
 
@@ -63,7 +63,7 @@ def _hits(listing: str, names: list[str]) -> dict[str, int]:
 
 
 def of_a_step(program: str, checkpoint: str) -> dict[str, int]:
-    """What step STEPS + 1 adds, by kind of call."""
+    """Return the counts that step STEPS + 1 adds, by kind of call."""
     few, more = (calls(program, checkpoint, n) for n in (STEPS, STEPS + 1))
     return {kind: sum(more[name] - few[name] for name in group) for kind, group in CALLS.items()}
 

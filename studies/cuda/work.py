@@ -1,4 +1,4 @@
-"""What is counted, run under a stand-in for the CUDA driver: `python -m studies.cuda.work CLOUD PART`.
+"""The work that is counted under a stand-in for the CUDA driver: `python -m studies.cuda.work CLOUD PART`.
 
 CLOUD is the checkpoint of a fit, or `giants`: 300 random Gaussians that fill the image. PART is
 
@@ -94,7 +94,7 @@ def steps(fit: Fit, count: int) -> None:
 
 
 def sizes(gaussians: Sequence, view: View) -> dict:
-    """How much there is to do."""
+    """Return the sizes of the work."""
     Float64: Any = dr.float64_array_t(mi.Float)
     area = dr.sum(Float64(project(gaussians, view, FIT).area))
     return dict(

@@ -1,1 +1,1 @@
-"""Which errors of a scanner explain what a reconstruction leaves of a measured scan."""
+"""Errors of a scanner that explain the residual of a measured scan's reconstruction."""

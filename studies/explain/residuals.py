@@ -1,4 +1,4 @@
-"""What explains the error of a measured scan: corrections added one after another, judged by views that were held out.
+"""Explanation of a measured scan's error: corrections are added one after another and judged by held-out views.
 
 `calibrate` finds all numbers at once from the views that are kept. Then each row of the table takes one more kind of them,
 reconstructs those views, and predicts the others, whose corrections are those for their time. The prediction is compared with

@@ -20,7 +20,7 @@ from studies.fuzz.readers import case, reader, write
 
 
 def verdict(name: str, folder: Path, rng: Random) -> str:
-    """What a reader makes of one case, whose files are written below `folder`."""
+    """Return the verdict of a reader on one case, whose files are written below `folder`."""
     index, file, content = case(name, rng)
     read, samples = reader(name)
     home = folder / f'{name.replace(", ", "-").replace(" ", "-")}{index}'

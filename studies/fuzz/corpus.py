@@ -302,7 +302,8 @@ def others() -> dict[str, list[Sample]]:
 
 
 def _checkpoints():
-    """As it is written, and as entries that get a right checksum after they are mutated: there a mutation gets further."""
+    """Make checkpoints as they are written, and as entries that get a right checksum after a mutation, so that the reader goes
+    further."""
     from lingo_mi.fitting.checkpoint import Checkpoint
     from lingo_mi.fitting.methods.lingo import LINGO
     from lingo_mi.fitting.start.start import StartingCloud

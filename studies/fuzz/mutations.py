@@ -1,4 +1,4 @@
-"""What is done to a good file: bytes, fields of a header, words of a text, and the data that a file is written from."""
+"""Mutations of a good file: bytes, fields of a header, words of a text, and the data from which a file is written."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _bytes(content: bytes, rng: Random) -> bytes:
 
 
 def _place(content, rng):
-    """Where: most often in the first half kilobyte, where headers are."""
+    """Return a random place: usually in the first half kilobyte, which holds the headers."""
     return rng.randrange(min(len(content), 512) if rng.random() < 0.7 else len(content))
 
 

@@ -22,7 +22,7 @@ CHUNK = 100  # cases that a child is given at once
 
 @dataclass
 class Tally:
-    """What the cases of one reader came to."""
+    """Counts of the outcomes of one reader's cases."""
 
     values: int = 0
     refused: int = 0

@@ -142,7 +142,7 @@ def reader(name: str) -> tuple[Callable[[Path, Random], None], list[Sample]]:
 
 
 def case(name: str, rng: Random) -> tuple[int, str, bytes]:
-    """Which sample of a reader, which of its files is mutated, and what it holds then."""
+    """Choose a sample of a reader and one of its files, and mutate the file."""
     sample = reader(name)[1]
     index = rng.randrange(len(sample))
     files = sample[index].files

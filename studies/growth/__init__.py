@@ -1,1 +1,1 @@
-"""How cost grows with pixels, views, Gaussians and voxels: CPU time and peak memory of every stage."""
+"""Growth of cost with pixels, views, Gaussians and voxels: CPU time and peak memory of every stage."""

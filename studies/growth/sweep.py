@@ -26,7 +26,7 @@ SHORT: dict[str, int] = dict(voxels=3, pixels=3, views=3, Gaussians=3)  # of the
 
 
 def number(axis: str, value: int) -> int:
-    """How many voxels, pixels, views or Gaussians a value of `SIZES` stands for."""
+    """Return the number of voxels, pixels, views or Gaussians that a value of `SIZES` stands for."""
     return value ** SIDES.get(axis, 1)
 
 
@@ -36,7 +36,7 @@ def sizes(axis: str, large: bool) -> list[int]:
 
 
 def planned(stage: str, large: bool) -> list[tuple[str, int]]:
-    """What is measured of a stage: pairs of an axis and a value of `SIZES`."""
+    """Return the measurements of a stage: pairs of an axis and a value of `SIZES`."""
     return [(axis, value) for axis in DEPENDS[stage] for value in sizes(axis, large)]
 
 

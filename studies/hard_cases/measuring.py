@@ -50,7 +50,7 @@ APPROXIMATE = 0.6
 
 @dataclass(frozen=True)
 class Result:
-    """What became of a case.
+    """Outcome of a case.
 
     Parameters
     ----------
@@ -234,7 +234,8 @@ def _measure_scan(case):
 
 
 def miss(case: ViewCase | VoxelCase | ScanCase, result: Result, variant: str) -> str:
-    """What a case shows that it may not, in words; '' where it is within its tolerances, refused or warned of as it should be.
+    """Describe in words the faults of a case. The text is empty if the case is within its tolerances, or was refused or warned
+    of as it should be.
 
     Parameters
     ----------

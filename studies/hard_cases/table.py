@@ -45,7 +45,7 @@ class Stored:
         return self.variant.split('_')[0].upper()
 
     def misses(self, cases: Sequence) -> dict[str, str]:
-        """What cases show that they may not, in words, by name; a case that was not measured misses nothing."""
+        """Return the faults of cases in words, by name. A case that was not measured has no faults."""
         misses = {
             case.name: miss(case, self.results[case.name], self.variant) for case in cases if case.name in self.results
         }
@@ -60,7 +60,7 @@ def store(path: Path, variant: str, results: Sequence[tuple]) -> None:
 
 
 def stored(path: Path) -> Stored:
-    """What `store` wrote.
+    """Read the results that `store` wrote.
 
     Raises
     ------

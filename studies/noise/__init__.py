@@ -1,1 +1,1 @@
-"""What an early stop and weights of pixels are worth to a fit of noisy projections."""
+"""Gain of an early stop and of pixel weights in a fit of noisy projections."""

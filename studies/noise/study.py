@@ -1,4 +1,4 @@
-"""What an early stop and weights of the pixels are worth to a fit of noisy projections.
+"""Gain of an early stop and of pixel weights in a fit of noisy projections.
 
 A cell is one fit of one scan by `Fast`: a JSON file, written atomically. A stored cell is not computed again.
 

@@ -81,7 +81,7 @@ def _wrong(volume: np.ndarray, held_out: Scan) -> float:
 
 
 def _finer(volume: np.ndarray, scan: Scan) -> int:
-    """How many voxels of the volume are as wide as one of the scan's."""
+    """Return the number of voxels of the volume that are as wide as one voxel of the scan."""
     return volume.shape[0] // scan.geometry.grid.shape[0]
 
 

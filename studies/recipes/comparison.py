@@ -48,7 +48,7 @@ LONGEST = 200  # characters of a folder's name before it is cut; file systems al
 
 @dataclass(frozen=True)
 class Comparison:
-    """What the fits of a comparison have in common.
+    """Properties that the fits of a comparison share.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""How far `Best`, which knows no truth, is behind the best of fixed settings."""
+"""Distance between `Best`, which does not know the truth, and the best fixed settings."""

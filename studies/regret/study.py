@@ -1,4 +1,4 @@
-"""How far `Best`, which knows no truth, is behind the best of fixed settings, chosen with the truth at hand.
+"""Distance between `Best`, which does not know the truth, and the best fixed settings, chosen by the truth.
 
 A cell is one setting on one scan: a JSON file, written atomically. A stored cell is not computed again.
 

@@ -295,7 +295,7 @@ def test_interrupt_leaves_a_checkpoint(scene, tmp_path):
 
 
 def test_interrupt_while_a_scene_loads(tmp_path):
-    """Where Mitsuba makes an error of its own of it, in the plugin that makes a large phantom."""
+    """Mitsuba turns the interrupt into an error of its own, in the plugin that makes a large phantom."""
     (tmp_path / 'slow.xml').write_text(
         SCENE.replace('<integer name="size" value="24"/>', '<integer name="size" value="400"/>')
     )

@@ -42,7 +42,7 @@ MINE = 'notes.txt', '.writable', 'metrics.json.partial', 'views/mine.exr'
 
 @dataclass
 class Case:
-    """What is interrupted.
+    """Command that is interrupted.
 
     prepare   makes the folder as it is before
     task, arguments   as of `Server.run`

@@ -79,7 +79,7 @@ def test_there_are_commands():
 
 @pytest.mark.parametrize('source', ['docs/how_to/measured_data.md', 'lingo_mi/cli/import_frames.py'])
 def test_the_first_import_of_the_documentation_runs(source, tmp_path, monkeypatch, capsys):
-    """As it stands there, with folders and files of these names."""
+    """Its code runs unchanged, with folders and files of these names."""
     tifffile = pytest.importorskip('tifffile', reason='tifffile (the `formats` extra) is not installed')
     words = next(words for words in commands_in((ROOT / source).read_text(encoding='utf-8')) if words[1] == 'import')
     monkeypatch.chdir(tmp_path)

@@ -1,4 +1,4 @@
-"""What `lingo-mi fit` and `Fit.save` do to a folder that has something in it already."""
+"""`lingo-mi fit` and `Fit.save` on a folder that already has files."""
 
 import hashlib
 import os
@@ -74,7 +74,7 @@ def test_force_refuses_a_foreign_file_of_a_name_that_it_needs(scene, tmp_path, n
 
 
 def test_an_empty_folder_but_for_leftovers(scene, tmp_path):
-    """What a killed process leaves behind before its first checkpoint: neither a result nor something to go on from."""
+    """A process killed before its first checkpoint leaves neither a result nor a fit that can be resumed."""
     leftover = tmp_path / f'.lingo_mi-{16 * "0"}-checkpoint.npz'
     for path in (leftover, tmp_path / LOCK):
         path.touch()

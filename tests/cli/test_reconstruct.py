@@ -123,7 +123,7 @@ def test_an_unset_variable_of_the_shell(scene, tmp_path, option):
 
 
 def test_fdk_of_a_turned_panel(dataset, tmp_path):
-    """As good as of the scene whose panel is upright."""
+    """The error is as small as in the scene whose panel is upright."""
     panel = '<string name="dDetector" value="1.8, 1.8"/>'
     path = changed_scene(tmp_path, (panel, panel + '<string name="rotDetector" value="3, -4, 5"/>'))
     code, _, err = run(RECONSTRUCT, path, '--out', tmp_path / 'v.nii')

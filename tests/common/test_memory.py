@@ -1,4 +1,4 @@
-"""How much memory this process may take: control groups as Linux shows them, and limits of address space in one line."""
+"""The memory that this process may take: control groups as Linux shows them, and limits of address space, in one line."""
 
 import subprocess
 import sys
@@ -33,7 +33,7 @@ def test_limits_of_control_groups(tmp_path):
 
 
 def test_without_control_groups_and_limits(monkeypatch):
-    """As on Windows: the memory of the machine is known."""
+    """The memory of the machine is known without control groups, for example on Windows."""
     monkeypatch.setitem(sys.modules, 'resource', None)
     monkeypatch.setattr(memory, '_control_groups', lambda: [])
     assert memory.host_room() == psutil.virtual_memory().total

@@ -1,4 +1,4 @@
-"""What objects show of themselves in a notebook: the pixels they hold, the right way up, with text as text."""
+"""Objects in a notebook: the pixels that they hold, the right way up, with text as text."""
 
 import base64
 import io

@@ -1,4 +1,4 @@
-"""Where Dr.Jit finds LLVM, and its threads."""
+"""Dr.Jit's LLVM and its threads."""
 
 import os
 import sys

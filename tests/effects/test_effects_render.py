@@ -209,7 +209,7 @@ def test_what_saturates_has_no_derivative(output):
 
 @pytest.mark.parametrize('film', [dict(gain=0.3), dict(gain=0.2, saturation=0.9)])
 def test_derivative_with_gains_that_are_left_in(film):
-    """That of the image as it is measured, by differences."""
+    """The derivative of the measured image agrees with differences."""
     scene = scene_of(None, None, detector(corrected=False, **film), output='transmission')
     params = mi.traverse(scene)
     density = mi.Float(params['cloud.density'])
@@ -374,7 +374,7 @@ def test_materials_of_shapes_in_a_cloud():
 
 @physics
 def test_simulated_noise_is_not_subtracted(scene_file):
-    """What linearising leaves is the error of expected views, whatever noise the effects have."""
+    """The rest after linearising is the error of expected views, whatever noise the effects have."""
     loaded = load_scene(scene_file(XML.replace('value="1e4"', 'value="100"')))
     scan, objects = take_scan(loaded).train, find_objects(loaded.scene)
     effects = scan.effects

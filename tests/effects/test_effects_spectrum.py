@@ -139,7 +139,7 @@ def test_attenuation(material, energy, mu):
     ],
 )
 def test_error_against_the_full_spectrum(materials, errors, response):
-    """What bands promise holds on other points than those that they were fitted to, and falls with their number."""
+    """The promised error holds at points that the bands were not fitted to, and falls with the number of bands."""
     spectrum = tube_spectrum(120.0)
     signal, r = spectrum.detected(response), ratios(spectrum, *materials)
 

@@ -37,7 +37,7 @@ def test_what_a_training_stores(tmp_path):
 
 
 def test_bounded_scales(tmp_path):
-    """As with its defaults: between 0.0005 and 0.5 of a volume that is 2 long."""
+    """The stored bounds hold; by default, scales are between 0.0005 and 0.5 in a volume that is 2 long."""
     path = write(tmp_path / 'a.pickle', stored(scale_bound=np.array([0.001, 1.0])))
     expected = 100 * (0.001 + 0.999 / (1 + np.exp([[2.0, 1, 0]])))
     np.testing.assert_allclose(read_r2_cloud(path, GRID)[1], expected, rtol=1e-6)

@@ -470,7 +470,7 @@ def test_a_tiff_whose_images_have_no_end(tmp_path, bigtiff, byteorder):
 # By TIFF's numbers: bytes, deflate by its authors' word (at most 1032:1), and PackBits, whose longest run takes 2 bytes for 128.
 @pytest.mark.parametrize('compression, ratio', [(1, 1), (8, 1032), (32946, 1032), (32773, 64)])
 def test_what_a_tiff_file_may_claim(tmp_path, compression, ratio):
-    """As many bytes as its compression can make of the whole file, and not one more."""
+    """It may claim as many bytes as its compression can make of the whole file, and not one more."""
     tifffile = needs('tifffile')
     path = tmp_path / 'v.tif'
     tifffile.imwrite(path, np.zeros((1, 999), np.uint8), photometric='minisblack', rowsperstrip=1, metadata=None)

@@ -266,7 +266,8 @@ def test_rounding_is_weighed():
 
 
 def test_saturated_pixels_pull_only_from_above():
-    """What is expected below the saturation counts as equal to it; what is above is drawn down; FDK takes them for air."""
+    """An expected value below the saturation counts as equal to it; a value above it is drawn down; FDK takes such pixels for
+    air."""
     g = geometry(3)
     effects = Effects(None, None, detector(saturation=0.8, gain=0.05))
     least = effects.detector.least(g.nDetector)
@@ -347,7 +348,7 @@ def test_what_cannot_be_modelled(effects, match):
 
 
 def test_a_checkpoint_needs_the_effects_that_were_modelled(tmp_path, monkeypatch):
-    """Which stand in result.xml beside it."""
+    """The effects are in result.xml beside the checkpoint."""
     effects, path = Effects(None, None, detector(psf=15.0)), tmp_path / 'fit.npz'
     scan = replace(tiny_scan(geometry(3)), effects=effects)
     done = run(scan, SHORT.changed(iterations=2), path=path)

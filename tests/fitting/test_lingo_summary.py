@@ -1,4 +1,4 @@
-"""What a fit says that the parts of LINGO did."""
+"""The line of a fit about the parts of LINGO."""
 
 from __future__ import annotations
 

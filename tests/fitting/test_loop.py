@@ -304,7 +304,7 @@ def test_total_variation_beside_more_views(scan):
 
 
 def test_rates_in_lists(scan):
-    """As JSON has them."""
+    """Rates may be lists, as in JSON."""
     rates, corrections = replace(SHORT.rates, rate_centre=[1e-3, 1e-4]), replace(SHORT.corrections, rate_pose=[0, 0])
     assert rates.rate_centre == (1e-3, 1e-4)
     run(scan, replace(SHORT.changed(iterations=1), rates=rates, corrections=corrections))

@@ -1,4 +1,4 @@
-"""What a fit writes when nothing is known but its checkpoint."""
+"""The files that a fit writes from its checkpoint alone."""
 
 import json
 from dataclasses import replace

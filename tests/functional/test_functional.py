@@ -467,7 +467,7 @@ def test_twice_through_one_graph_of_torch():
 
 
 def test_back_through_graphs_in_another_thread():
-    """As PyTorch does on a GPU, in one thread for all."""
+    """PyTorch does so on a GPU, in one thread for all graphs."""
     framework('torch')
     with ThreadPoolExecutor(1) as pool:
         for function in (project, voxelize) * 2:

@@ -69,7 +69,7 @@ def pair(shape_x, shape_y, seed=0):
 
 
 def off(A, x, y):
-    """How far A.T is from the transpose of A, relative to |A x| |y|."""
+    """Return the difference of A.T from the transpose of A, relative to |A x| |y|."""
     ax, aty = A(x).astype(float), A.T(y).astype(float)
     return abs(np.vdot(ax, y) - np.vdot(x, aty)) / (np.linalg.norm(ax) * np.linalg.norm(y))
 
@@ -423,7 +423,7 @@ print(os.waitpid(child, 0)[1], np.array_equal(A(np.ones(A.domain_shape)), before
 
 @pytest.mark.skipif(not hasattr(os, 'fork'), reason='there is no fork here')
 def test_a_forked_process_goes_on():
-    """As a worker of PyTorch's DataLoader does."""
+    """A worker of PyTorch's DataLoader is such a process."""
     done = subprocess.run([sys.executable, '-c', FORKED], capture_output=True, text=True, timeout=120)
     assert done.stdout == '0 True\n', done
 

@@ -240,7 +240,7 @@ def test_tigre_circle():
 
 
 def test_tigre_repeats_its_numbers():
-    """What `check_geo` makes of them: every number once a view, angles with two more that are zero."""
+    """The numbers of `check_geo` agree: it repeats each number for every view, and adds two zeros to angles."""
     n = len(ANGLES)
     geo = tigre(
         DSO=np.full(n, 900.0),
@@ -339,7 +339,7 @@ PLAIN = {
 
 
 def geom_2vec(proj_geom):
-    """What `astra.functions.geom_2vec` says of both types, by its documentation."""
+    """Return the vectors that the documentation of `astra.functions.geom_2vec` gives for both types."""
     rows = []
     for a in proj_geom['ProjectionAngles']:
         s, c = np.sin(a), np.cos(a)

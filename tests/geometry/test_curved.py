@@ -169,7 +169,7 @@ def test_bad_input(message):
 
 
 def astra_pixels(vectors, view, x, y):
-    """Where ASTRA's `cyl_cone_vec` has the pixel positions x, y: a restatement of `getCylConeAxes` and its kernels."""
+    """Return the positions of the pixels x, y in ASTRA's `cyl_cone_vec`: a restatement of `getCylConeAxes` and its kernels."""
     d, u, v, radius = vectors[view, 3:6], vectors[view, 6:9], vectors[view, 9:12], vectors[view, 12]
     along = -np.cross(u, v) * (radius / (np.linalg.norm(u) * np.linalg.norm(v)))
     across, axis = u * (radius / np.linalg.norm(u)), d - along

@@ -46,7 +46,7 @@ def test_steps_that_span_a_panel(sine, refused):
 
 
 def finite_or_refused(make):
-    """What `make` gives, all of whose numbers are finite; None where it refuses in one line."""
+    """Return the result of `make`, all of whose numbers are finite, or None if it refuses in one line."""
     with warnings.catch_warnings():
         warnings.simplefilter('error')  # of an overflow too
         warnings.filterwarnings('ignore', message='angles are radians')

@@ -25,7 +25,7 @@ def test_corners_on_and_beside_the_lines_that_are_followed(shift):
 
 
 def test_parts_that_overlap_count_twice():
-    """As the lengths of rays through them do."""
+    """The lengths of rays through them count twice, too."""
     one, other = (trimesh.creation.box((2.0, 2.0, 2.0)).triangles + shift for shift in (-0.5, 0.25))
     assert voxelize_triangles(np.concatenate([one, other]), *GRID).max() == pytest.approx(2)
     np.testing.assert_allclose(

@@ -1,4 +1,4 @@
-"""What tests share with fdk."""
+"""Helpers of tests of FDK."""
 
 import numpy as np
 
@@ -46,7 +46,8 @@ BALL = (np.array([12.0, -9.0, 6.0]), np.array([25.0, 25.0, 25.0]), 0.02)
 
 
 def ball_errors(volume, geo):
-    """What is wrong with BALL: its mean density within half its radius, relative, and its place, in voxels of the worst axis."""
+    """Return the errors of BALL: its mean density within half its radius, relative, and its place, in voxels of the worst
+    axis."""
     x = centres(geo)
     near = np.linalg.norm(x - BALL[0], axis=-1)
     inside = near < 30  # farther out, the faint shading of what a cone misses weighs by its distance

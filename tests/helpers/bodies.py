@@ -1,4 +1,4 @@
-"""What tests share with geometry."""
+"""Helpers of tests of geometry."""
 
 import numpy as np
 

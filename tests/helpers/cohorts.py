@@ -1,4 +1,4 @@
-"""What `lingo-mi batch` leaves in out/ of a folder."""
+"""The files of `lingo-mi batch` in out/ of a folder."""
 
 import csv
 

@@ -1,4 +1,4 @@
-"""What tests share with fit effects."""
+"""Helpers of tests of fits with effects."""
 
 import mitsuba as mi
 import numpy as np

@@ -1,4 +1,4 @@
-"""What tests share with effects render."""
+"""Helpers of tests of rendered effects."""
 
 from importlib.util import find_spec
 

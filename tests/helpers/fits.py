@@ -1,4 +1,4 @@
-"""What tests share with fit."""
+"""Helpers of tests of fits."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar

@@ -1,4 +1,4 @@
-"""What tests share with grid projector."""
+"""Helpers of tests of the grid projector."""
 
 import drjit as dr
 import mitsuba as mi

@@ -1,4 +1,4 @@
-"""What tests share with joseph."""
+"""Helpers of tests of Joseph's projector."""
 
 import drjit as dr
 import mitsuba as mi

@@ -1,4 +1,4 @@
-"""What tests of poses share."""
+"""Helpers of tests of poses."""
 
 import numpy as np
 

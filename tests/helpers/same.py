@@ -1,4 +1,4 @@
-"""What does not depend on how it is asked for."""
+"""Comparisons of results that must not depend on the way they are computed."""
 
 import os
 
@@ -10,7 +10,7 @@ STAND_IN = 'LINGO_MI_CUDA_STAND_IN' in os.environ  # for the CUDA driver: one th
 
 
 def adds_in_any_order() -> bool:
-    """Whether the active variant adds atomically, so that sums differ by rounding: a real GPU does."""
+    """Return whether the active variant adds atomically, so that sums differ by rounding. A real GPU does."""
     return dr.backend_v(mi.Float) == dr.JitBackend.CUDA and not STAND_IN
 
 

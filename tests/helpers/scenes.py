@@ -1,4 +1,4 @@
-"""What tests share with integrator."""
+"""Helpers of tests of the integrator."""
 
 import mitsuba as mi
 import numpy as np

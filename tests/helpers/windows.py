@@ -11,7 +11,7 @@ from lingo_mi.storage import file_access, folder_lock
 
 
 def in_use(path):
-    """Whether this process has the file, or one in the folder, open or mapped."""
+    """Return whether this process has the file, or a file in the folder, open or mapped."""
     path = os.path.realpath(path)
     lines = Path('/proc/self/maps').read_text(encoding='utf-8').splitlines()
     names = {line.split(maxsplit=5)[-1] for line in lines}

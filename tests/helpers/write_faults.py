@@ -28,7 +28,7 @@ class Faults:
         self.failed = []
 
     def within(self, path, dir_fd=None):
-        """Whether calls for this path, or open file, count."""
+        """Return whether calls for this path or open file count."""
         try:
             if dir_fd is not None:
                 return False

@@ -78,7 +78,7 @@ def test_doubled_and_black_views(foot):
 @pytest.mark.parametrize('first', [0, 1])
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_frames_sorted_by_name(mode, first):
-    """As text: 0, 1, 10, 11, ..."""
+    """Names in the order of text are 0, 1, 10, 11, ..."""
     scan = scanned('chest', mode, views=60)
     order = np.array(sorted(range(first, first + 60), key=str)) - first
     noise = np.random.default_rng(0).normal(0, 0.002 * scan.projections.max(), scan.projections.shape)
@@ -222,7 +222,8 @@ def test_a_drift_of_air_does_not_change_the_sense(level):
 
 @pytest.mark.parametrize('counts', [1.0, 4e4])
 def test_intensities(foot, counts):
-    """As fractions and as counts; with 2 % of noise and a beam that is a tenth darker at the edges. Nothing else is advised."""
+    """Fractions and counts are recognised, with 2 % of noise and a beam that is a tenth darker at the edges. Nothing else is
+    advised."""
     light = np.random.default_rng(0).normal(1, 0.02, foot.projections.shape)
     light = light * np.exp(-foot.projections / foot.projections.max() * 2)
     light = light * (1 - 0.1 * np.linspace(-1, 1, PIXELS) ** 2) * counts

@@ -1,4 +1,4 @@
-"""What napari gets: layers in mm, of each kind of file and of a result; and a manifest that names what is there."""
+"""The reader of napari: layers in mm from each kind of file and from a result; and a manifest whose names exist."""
 
 import importlib
 from importlib.resources import files

@@ -313,7 +313,7 @@ def test_real_attenuation_is_that_of_bone(name):
 
 
 def test_script_writes_real_attenuation(tmp_path, monkeypatch):
-    """As volume and as Gaussians, by the name that Python and scenes have for it."""
+    """It writes a volume and Gaussians, by the name that Python and scenes use."""
     for out in ('foot.nii.gz', 'gaussians.ply'):
         name = out.split('.')[0]
         for kind in ('x3d', 'real'):

@@ -88,7 +88,7 @@ def test_meshes(sharing):
 @pytest.mark.parametrize('test', [test_images, test_voxels, test_meshes])
 @pytest.mark.parametrize('capability', [80, 90])
 def test_layouts_of_a_gpu(capability, test, monkeypatch):
-    """Where lanes stand on a GPU, whatever this runs on."""
+    """The lanes of a GPU's layout, on any machine."""
     monkeypatch.setattr(balance, '_on_cpu', lambda: False)
     monkeypatch.setattr(balance, 'gpu', lambda: SimpleNamespace(capability=capability))
     monkeypatch.setattr(balance, 'resident_warps', lambda: 8)

@@ -89,7 +89,7 @@ def cloud_of(name='random', n=40):
     indirect=['scanner'],
 )
 def test_images_and_gradients(scanner, name):
-    """As accurate as on flat panels: `test_splat` allows the same."""
+    """They are as accurate as on flat panels: `test_splat` has the same tolerance."""
     cloud, pose = cloud_of(name), lines(scanner)
     expected = oracle.line_integrals(cloud, pose)
     weights = np.random.default_rng(0).normal(size=len(expected)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""How many items lie in one element: piles are found, spread clouds have none."""
+"""Counts of items in one element: piles are found, and spread clouds have none."""
 
 import mitsuba as mi
 import numpy as np

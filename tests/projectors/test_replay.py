@@ -107,7 +107,7 @@ def test_compiles_nothing_anew():
 
 
 def test_from_rows():
-    """As `lingo_xray` calls it: to the last bit what the columns give."""
+    """Rows give the values of columns to the last bit; `lingo_xray` passes rows."""
     rows = uploaded(np.concatenate([np.array(x) for x in cloud(200)[:3]]).T.ravel())
     upstream, actual = uploaded(np.random.default_rng(2).normal(size=SIDE**2)), []
     for by_rows in (False, True, True):

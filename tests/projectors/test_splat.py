@@ -435,7 +435,7 @@ def test_footprints_are_not_widened_unasked():
 
 @pytest.mark.parametrize('shape', [(33, 33), (17, 33)])
 def test_the_mean_over_a_pixel_widens_a_footprint_by_its_variance(shape):
-    """That of a unit square, 1/12 along each axis: the peak of a round one of variances a, b falls by sqrt(a b)."""
+    """A unit square has the variance 1/12 along each axis: the peak of a round footprint of variances a, b falls by sqrt(a b)."""
     frames, _ = scanner('parallel', shape=shape, size=(3.3, 3.3))
     sigma = 0.15  # in pixels of the panel: the variances a and b
     a, b = ((sigma / np.linalg.norm(step[0])) ** 2 for step in (frames.u, frames.v))

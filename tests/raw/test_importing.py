@@ -405,7 +405,7 @@ def test_rows_of_rtk_run_up(tmp_path, named):
 
 @pytest.mark.parametrize('crop', [(0, 24, 0, 40), (0, 9, 0, 40), (3, 24, 0, 14)])
 def test_the_own_grid_lies_where_the_panel_sees(tmp_path, raw, crop):
-    """As high as the rows that are kept, and around the axis as wide as the farthest column."""
+    """The grid is as high as the kept rows, and around the axis as wide as the farthest column."""
     values = dict(DSO=100, DSD=150, dDetector=[1, 1], angles=list(range(0, 360, 60)))
     (tmp_path / 'scan.yml').write_text(yaml.safe_dump(values))
     files = save(tmp_path, raw)

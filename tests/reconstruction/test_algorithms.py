@@ -30,7 +30,7 @@ def quick(name):
 
 
 def inputs(name, scan):
-    """What `run` of this algorithm cannot do without."""
+    """Return the inputs that `run` of this algorithm needs."""
     return dict(start=np.ones(scan.geometry.grid.shape)) if name == 'refined' else {}
 
 
@@ -81,7 +81,7 @@ def test_options_are_fields(scan):
 
 
 def test_defaults_are_tigres():
-    """As TIGRE 2 has them for Python; the order of views as for MATLAB."""
+    """They are TIGRE 2's defaults for Python; the order of views is the default for MATLAB."""
     sweeps = dict(lmbda=1.0, lmbda_red=0.99, noneg=True)
     descent = dict(tviter=20, alpha=0.002, alpha_red=0.95, rmax=0.95)
     expected = {

@@ -172,7 +172,7 @@ def test_the_plan_is_told_and_can_be_kept():
 
 
 def test_progress_goes_on_to_the_last_step_but_one():
-    """Where trials take more steps than were foreseen, it waits there."""
+    """The progress waits there if the trials take more steps than were foreseen."""
     calls = []
     count = Best._counter(lambda done, total, residual: calls.append((done, total)), 4)
     for _ in range(5):

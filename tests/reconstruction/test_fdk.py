@@ -61,7 +61,8 @@ def test_parker_weights_of_opposite_rays_sum_to_one(span):
 
 
 def test_parker_weights_branch_by_branch():
-    """As Parker and Silver print them, with the half excess d and the fan angle g towards the side that is seen again last."""
+    """The weights are Parker's and Silver's, with the half excess d and the fan angle g towards the side that is seen again
+    last."""
     n, span = 36, np.radians(240)
     geo = geometry(angles=circular(n, 240), offDetector=(0.0, 0.0))
     g, d = np.arctan((np.arange(72) - 35.5) * 3 / 450), (span - np.pi) / 2

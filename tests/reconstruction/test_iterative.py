@@ -81,7 +81,7 @@ def test_sart_is_the_transcription(system, blocksize, noneg):
 
 @pytest.mark.parametrize('blocksize', [1, 2])
 def test_weighted_sart_is_that_of_the_scaled_system(system, blocksize):
-    """Where weights are zero nothing changes; a factor on all of them is nothing."""
+    """Zero weights change nothing, and a common factor of all weights has no effect."""
     scan, A, b = system
     rng = np.random.default_rng(1)
     start, s = rng.random(scan.geometry.grid.shape), rng.random(scan.geometry.grid.shape) ** 3
@@ -110,7 +110,7 @@ def test_weights_that_are_none(system, value, why):
 
 
 def test_blurred_sart_is_the_transcription(system):
-    """What a pass changes is blurred, and then negative densities are set to zero."""
+    """The change of a pass is blurred, and then negative densities are set to zero."""
     scan, A, b = system
     start, deviations = np.random.default_rng(1).random(scan.geometry.grid.shape), (0.7, 0.5, 0.6)
     for noneg in (True, False):

@@ -54,7 +54,7 @@ def test_total_variation_is_the_least(noisy, strength, upper):
 
 
 def test_total_variation_is_that_of_scikit_image(noisy):
-    """Which has the same differences but no bounds: far above zero there are none."""
+    """scikit-image has the same differences but no bounds: far above zero there are none."""
     expected = denoise_tv_chambolle(noisy + 5, weight=0.2, eps=1e-9, max_num_iter=3000)
     np.testing.assert_allclose(prox(TV(inner=500), noisy + 5, 0.2), expected, atol=2e-3)
 

@@ -79,7 +79,7 @@ def taken(algorithm, *sizes):
 @pytest.mark.thorough
 @pytest.mark.parametrize('algorithm', NEEDS)
 def test_peak_memory_of_small_scans(algorithm):
-    """What `reconstruct.py` goes by. Small ones take up to twice that share, since Dr.Jit keeps some of what is freed."""
+    """The estimate of `reconstruct.py` holds within a factor of two: Dr.Jit keeps some of the freed memory."""
     assert 0.7 < taken(algorithm, 192, 288, 12)[0] < 2
 
 

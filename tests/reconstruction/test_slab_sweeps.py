@@ -255,7 +255,7 @@ print(peak() - before, expected)
     ids=['slabs', 'projections', 'blocks'],
 )
 def test_peak_memory(tmp_path, sizes):
-    """What `needed` says, whatever the number of slices: the volume of the first takes 134 MB by itself."""
+    """`needed` predicts it, whatever the number of slices: the volume of the first takes 134 MB by itself."""
     for folder in ('first', 'second'):  # the first compiles the kernels, which takes memory of its own
         command = [sys.executable, '-c', PROGRAM, str(tmp_path / folder), *map(str, sizes)]
         taken, expected = map(int, subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())

@@ -14,7 +14,7 @@ from lingo_mi.report.payload import error_maps, slice_payload
 
 
 def unpacked(packed):
-    """What `decode.js` does, step by step."""
+    """Unpack like `decode.js`, step by step."""
     low, high = np.frombuffer(gzip.decompress(base64.b64decode(packed.text)), np.uint8).reshape(2, -1).astype(int)
     folded = low | high << 8
     changes = (folded >> 1) ^ -(folded & 1)

@@ -166,7 +166,7 @@ def test_keys_and_wheel_change_the_slice(page):
 
 
 def test_a_pixel_of_the_slice_is_the_voxel_below_the_pointer(page, data):
-    """Which way up: x to the right and y up, read from the canvas and from the pointer's row."""
+    """The picture is the right way up: x to the right and y up, read from the canvas and from the pointer's row."""
     box = page.locator('[data-axis="2"]').bounding_box()
     z = at(page)[2]
     for i, j in ((3, 5), (20, 5), (11, 17)):

@@ -1,4 +1,4 @@
-"""What a file, a scene or a command says is text in the report, never markup: by a parser, and in a browser if there is one."""
+"""Text of a file, a scene or a command is text in the report, never markup: by a parser, and in a browser if there is one."""
 
 import shutil
 import subprocess
@@ -76,7 +76,7 @@ def test_markup_is_text(tmp_path, plain, markup):
 
 
 def dom(path, home):
-    """What a browser has made of a page, as HTML."""
+    """Return a page after a browser has loaded it, as HTML."""
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:
         pytest.skip(f'no browser is installed: none of {", ".join(BROWSERS)}')

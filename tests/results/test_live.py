@@ -239,7 +239,7 @@ def entry(iteration, **more):
 
 
 def asked(live, seen=0, place=''):
-    """What the page is told."""
+    """Return the answer of the server to the page."""
     status, _, text = get(live, f'/state?{token(live)}&seen={seen}&history={place}')
     assert status == 200
     return json.loads(text, parse_constant=pytest.fail)  # NaN and Infinity are no JSON

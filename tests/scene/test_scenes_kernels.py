@@ -1,4 +1,4 @@
-"""What the shipped scenes launch: the projectors' kernels alone, for none of them names an effect."""
+"""Kernels of the shipped scenes: they launch the projectors' kernels alone, since no scene names an effect."""
 
 from functools import partial
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What may be read: regular files, and of those that a file names those beside or below it."""
+"""Files that may be read: regular files, and files named in them if they are beside or below them."""
 
 import os
 import threading

@@ -1,4 +1,4 @@
-"""What is ours in a folder, and whether it belongs together."""
+"""Files in a folder that are ours, and whether they belong together."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""What a step of a fit is made of."""
+"""The parts of a fit's step."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What is checked and counted of CUDA without a GPU: assembling, counting, the model, the page and the command."""
+"""Checks and counts of CUDA without a GPU: assembling, counting, the model, the page and the command."""
 
 import subprocess
 from collections import Counter

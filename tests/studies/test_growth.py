@@ -1,4 +1,4 @@
-"""How cost grows: the stages run, the laws are what they must be, and the command writes what it says."""
+"""Growth of cost: the stages run, the laws are right, and the command writes the results that it announces."""
 
 import contextlib
 import io

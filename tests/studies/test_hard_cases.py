@@ -195,7 +195,7 @@ def test_command(tmp_path, monkeypatch):
     ],
 )
 def test_a_gaussian_that_is_no_number_is_never_skipped(mode, name, value):
-    """Who calls the projector directly gets an image that is none; scenes are refused by name (above)."""
+    """A direct call of the projector gives an image without finite values; scenes are refused by name (above)."""
     frames, shape = scanner(mode)
     cloud = random_cloud(np.random.default_rng(0), 5)
     values = getattr(cloud, name).copy()

@@ -1,4 +1,4 @@
-"""Which fits `python -m studies.recipes` runs, and which results it takes for them; the fits themselves are not run."""
+"""The fits that `python -m studies.recipes` runs, and the results that it takes for them. The fits themselves are not run."""
 
 import json
 import runpy

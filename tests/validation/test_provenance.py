@@ -1,4 +1,4 @@
-"""How a table was made, as JSON beside it."""
+"""The provenance of a table, as JSON beside it."""
 
 import datetime
 import json

@@ -207,7 +207,7 @@ def test_an_interrupted_fit_goes_on(tmp_path):
 @pytest.mark.thorough
 @pytest.mark.parametrize('content', [None, b'', b'PK'])
 def test_a_fit_without_its_checkpoint_is_fitted_again(tmp_path, content):
-    """Where a volume needs its cloud, or a longer fit would go on from it; what is stored stays."""
+    """It is fitted again if a volume needs its cloud or a longer fit would go on from it; what is stored stays."""
     arguments = '--views', '4', '--methods', 'r2'
     assert script('views', tmp_path, *arguments, '--iterations', '10')[0] == 0
     cells, fit = Cells(tmp_path, TINY), Fit('foot', 4, 'r2', 10)
@@ -417,7 +417,7 @@ def test_volumes_are_averaged_down(tmp_path, monkeypatch):
 
 @pytest.mark.thorough
 def test_objects_finer_than_the_voxels(tmp_path):
-    """What is scanned has twice the voxels; what is reconstructed, and its truth, has those of the scale."""
+    """The scanned object has twice the voxels; the reconstruction and its truth have the voxels of the scale."""
     scale = replace(TINY, finer=2)
     coarse, fine = Cells(tmp_path, TINY), Cells(tmp_path, scale)
     data, usual, scanned = fine.dataset('foot'), coarse.dataset('foot'), make('foot', 32)

@@ -1,1 +1,2 @@
-"""What a detector makes of line integrals, without a known spectrum: one small model a file, and `Response`, which fits them."""
+"""Models of a detector's response to line integrals, without a known spectrum: a file for each small model, and `Response`,
+which fits them."""

@@ -1,4 +1,4 @@
-"""What the models of a response have in common. NumPy."""
+"""Base of the models of a response. NumPy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ SURE = 3.0  # standard errors from which a number is taken for real
 
 @dataclass(frozen=True)
 class Place:
-    """Where pixels lie: y (down) and x over the half-sizes of the panel, -1 to 1, of the shape of an image or [pixels]."""
+    """Positions of pixels: y (down) and x over the half-sizes of the panel, from -1 to 1, in the shape of an image or
+    [pixels]."""
 
     y: np.ndarray
     x: np.ndarray
@@ -60,7 +61,7 @@ class ResponsePart(ABC):
         """Physical quantities by name, each [n], of the numbers c [n, K] of n views."""
 
     def doubt(self, errors: np.ndarray) -> str:
-        """Why `values` cannot be true, given their standard errors [T, K], in words; '' if they can."""
+        """Say in words why `values` cannot be true, given their standard errors [T, K]. The text is empty if they can be true."""
         return ''
 
     def hold(self) -> None:  # noqa: B027 - most models need none

@@ -1,4 +1,5 @@
-"""What every pixel adds to its line integrals, the same in all views: gains that the flat fields missed.
+"""Offsets of pixels: every pixel adds the same value to its line integrals in all views, because the flat fields missed its
+gain.
 
     m = p + o          o = -ln of a pixel's gain
 

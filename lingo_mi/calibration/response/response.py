@@ -23,7 +23,7 @@ ROBUST = 3.0  # median deviations beyond which a pixel counts less (Huber)
 
 @dataclass
 class Response:
-    """What the detector of a scan makes of line integrals, by parts: the first acts first.
+    """Response of a scan's detector to line integrals, in parts. The first part acts first.
 
     Parameters
     ----------
@@ -82,8 +82,8 @@ class Response:
         return cls(geometry, parts) if parts else None
 
     def applied(self, p: np.ndarray, geometry: Geometry) -> np.ndarray:
-        """What is measured of line integrals [view, v, u] in the views of a geometry, float32. Views that are not of the scan get
-        what was found for their time."""
+        """Return the measured values of line integrals [view, v, u] in the views of a geometry, float32. Views that are not in
+        the scan get the response that was found for their time."""
         return self._through(p, geometry, self.parts, lambda part: part.apply)
 
     def undone(self, m: np.ndarray, geometry: Geometry) -> np.ndarray:
@@ -130,8 +130,8 @@ class Response:
             part.values = np.array(arrays[f'response.{part.name}'], float)
 
     def names(self) -> dict[str, float]:
-        """What numbers are called in `changed`, with steps for differences: 'air0', of the constant, 'air1', of the first
-        polynomial in time, 'curve0_1', of the second coefficient. Those that `hold` takes out are left out."""
+        """Return the names of the numbers in `changed`, each with a step for differences. 'air0' is the constant, 'air1' the
+        first polynomial in time, and 'curve0_1' the second coefficient. The names that `hold` takes out are left out."""
         steps = {}
         for part in self.parts:
             for row in range(part.varies != 'one' and part.name == 'gain', len(part.values)):
@@ -148,7 +148,7 @@ class Response:
         return Response(self.geometry, parts)
 
     def doubts(self, numbers: dict[str, float], errors: dict[str, float]) -> dict[str, str]:
-        """Which numbers, by name, cannot be true, given their standard errors, and why."""
+        """Return the names of the numbers that cannot be true, given their standard errors, each with the reason."""
         reasons = {}
         for part in self.changed(numbers).parts:
             if why := part.doubt(_values(part, errors)):
@@ -156,7 +156,7 @@ class Response:
         return reasons
 
     def report(self) -> dict[str, list[float]]:
-        """What was found, in physical units, of every view (of a curve: once)."""
+        """Return the result in physical units for every view; a curve appears once."""
         values = {}
         for part, matrix in zip(self.parts, self._matrices(self.geometry)):
             values |= part.report(part.values if part.varies == 'one' else matrix @ part.values)

@@ -1,1 +1,1 @@
-"""What is fitted besides the cloud: kinds of `correction.Correction`, a file each."""
+"""Corrections that are fitted with the cloud: a file for each kind of `correction.Correction`."""

@@ -12,7 +12,7 @@ from lingo_mi.geometry.base import Geometry
 
 
 class CorrectedFit(Protocol):
-    """What a correction sees of the optimisation, and may change: the targets, and the share of the second material."""
+    """State of the optimisation that a correction may read and change: the targets, and the share of the second material."""
 
     method: Any
     model: Any
@@ -62,5 +62,5 @@ class Correction:
 
 
 def due(shares: tuple[float, ...], iteration: int, iterations: int) -> bool:
-    """Whether a fit of so many iterations is at one of these shares of them."""
+    """Return whether an iteration is at one of these shares of a fit."""
     return iteration in {round(share * iterations) for share in shares}

@@ -1,4 +1,4 @@
-"""What a neural field is told of a scan's densities: a bound, which is its unit, and their mean, which it starts from."""
+"""A scan's densities as a neural field needs them: a bound, which is its unit, and a mean, which is its start."""
 
 from __future__ import annotations
 

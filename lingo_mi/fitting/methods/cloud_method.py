@@ -1,4 +1,4 @@
-"""What all methods of Gaussians have in common: a start, a loss, densification, bounds."""
+"""Base of all methods with Gaussians: a start, a loss, densification, bounds."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class CloudMethod(Method):
     @property
     @abstractmethod
     def forward(self) -> ForwardModel:
-        """How Gaussians become the image of a view."""
+        """The model that turns Gaussians into the image of a view."""
 
     def with_lengths(self, geometry: Geometry) -> Self:
         """The method with lengths in the normalised frame, if some are in another unit."""

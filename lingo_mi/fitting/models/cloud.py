@@ -43,7 +43,7 @@ class CloudModel(Model):
 
     @property
     def amount_unit(self) -> float:
-        """What the fit counts as 1: nothing but 1 for opacities."""
+        """The amount that the fit counts as 1; for opacities it is 1 itself."""
         return 1.0
 
     def _images(

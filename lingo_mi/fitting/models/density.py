@@ -59,7 +59,7 @@ class DensityModel(CloudModel):
     def render(
         self, state: DeviceState, geometry: Geometry, progress: Callable[[int, int], None] | None = None
     ) -> np.ndarray:
-        """As in `Model`: line integrals, or -ln of the expected signal if the fit models effects."""
+        """Render as in `Model`: line integrals, or -ln of the expected signal if the fit models effects."""
         signal, share = self.signal, self.shares(state)
         if signal is None:
             return super().render(state, geometry, progress)
@@ -108,8 +108,8 @@ class DensityModel(CloudModel):
         return self.signal.shares(self.volume(state), centres, self.geometry.grid.half)
 
     def scattered_light(self, state: DeviceState, geometry: Geometry) -> np.ndarray | None:
-        """What the cloud scatters into the views of a geometry, as `ScatteredLight.estimate` gives it; None if the fit models no
-        scatter."""
+        """Return the light that the cloud scatters into the views of a geometry, by `ScatteredLight.estimate`; None if the fit
+        does not model scatter."""
         light = self.signal and self.signal.scattered
         return light.estimate(self.cloud(state), geometry) if light else None
 

@@ -67,7 +67,7 @@ class ForwardModel(ABC):
 
     @abstractmethod
     def may_stay(self, centre: np.ndarray, scale: np.ndarray, half: np.ndarray, largest: float) -> np.ndarray:
-        """Which Gaussians may stay, bool [N].
+        """Return the mask of the Gaussians that may stay, bool [N].
 
         Parameters
         ----------

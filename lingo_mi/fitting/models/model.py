@@ -1,4 +1,4 @@
-"""What renders and voxelizes the states of a fit."""
+"""Models that render and voxelize the states of a fit."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Model(ABC):
         return self.render(state, geometry)
 
     def expected(self, state: DeviceState, geometry: Geometry) -> np.ndarray:
-        """What the scan's detector is expected to measure: `render` with the response that was fitted."""
+        """Return the signal that the scan's detector is expected to measure: `render` with the fitted response."""
         rendered = self.render(state, geometry)
         return rendered if self.response is None else self.response.applied(rendered, geometry)
 

@@ -11,7 +11,7 @@ from lingo_mi.fitting.options.part import Part, require
 
 @dataclass(frozen=True)
 class Corrections(Part):
-    """What is fitted besides the cloud; everything is off unless asked for.
+    """Corrections that are fitted with the cloud. All are off by default.
 
     Time is told by the angles of the views, which must be in the order in which they were taken. A curve and scattered light,
     which a cloud would explain away, are sought before a fit: `lm.calibrate`.
@@ -49,10 +49,10 @@ class Corrections(Part):
 
     @property
     def moves_views(self) -> bool:
-        """Whether poses are corrected."""
+        """True if poses are corrected."""
         return max(self.rate_pose) > 0
 
     @property
     def responds(self) -> bool:
-        """Whether a response of the detector is fitted."""
+        """True if a response of the detector is fitted."""
         return any(x != 'off' for x in (self.fit_air, self.fit_gain, self.fit_pixels))

@@ -1,4 +1,4 @@
-"""When Gaussians are added and removed, and how; `lingo_mi.fitting.densify` does it."""
+"""Options of densification: when and how Gaussians are added and removed. `lingo_mi.fitting.densify` does the work."""
 
 from __future__ import annotations
 

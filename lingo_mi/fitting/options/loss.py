@@ -1,4 +1,4 @@
-"""What a step compares, and by which weights (paper, section III-C)."""
+"""Options of the loss: the comparison in a step, and its weights (paper, section III-C)."""
 
 from __future__ import annotations
 

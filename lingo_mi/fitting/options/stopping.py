@@ -1,4 +1,4 @@
-"""When a fit stops."""
+"""Options of the end of a fit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from lingo_mi.fitting.options.part import MOST_STEPS, Part, require
 
 @dataclass(frozen=True)
 class Stopping(Part):
-    """When a fit stops; see `lingo_mi.fitting.stopping`.
+    """Options of the end of a fit; see `lingo_mi.fitting.stopping`.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""Where the Gaussians of a fit start: kinds of `start.Start`, a file each."""
+"""Initial Gaussians of a fit: a file for each kind of `start.Start`."""

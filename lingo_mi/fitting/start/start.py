@@ -44,7 +44,7 @@ class StartingCloud:
 
 @dataclass(frozen=True)
 class Start(Part, ABC):
-    """Where the Gaussians of a fit start.
+    """Initial Gaussians of a fit.
 
     Attributes
     ----------

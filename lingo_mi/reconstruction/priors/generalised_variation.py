@@ -91,7 +91,7 @@ def _within(bound: Any, p: list[Any]) -> list[Any]:
 
 
 def _edges(size):
-    """Whether a voxel has a next one along each axis."""
+    """Return the masks of voxels that have a next voxel along each axis."""
     return [at + 1 < n for at, n, _ in places(size)[1]]
 
 

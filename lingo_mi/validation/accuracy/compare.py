@@ -172,7 +172,7 @@ def statistics(times: dict) -> dict:
 
 
 def peak_memory(function: Callable[[], Any]) -> tuple[Any, float]:
-    """What a call gives, and the MB that Dr.Jit holds at most during it, above what it held before."""
+    """Return the result of a call, and the most MB that Dr.Jit held during it beyond what it held before."""
     gc.collect()
     dr.sync_thread()
     dr.flush_malloc_cache()

@@ -66,7 +66,7 @@ def make_tables(results: dict, beside: dict | None = None) -> dict[str, str]:
 
 
 def conditions(c: dict) -> str:
-    """What was measured on what, in a sentence."""
+    """Describe the conditions of the measurements in a sentence."""
     s = c['sizes']
     return (
         f'`{c["variant"]}` on {c["threads"]} threads of {c["machine"]}. Unless a table says otherwise: '

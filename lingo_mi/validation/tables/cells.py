@@ -68,7 +68,7 @@ ALGORITHMS = {
 
 @dataclass(frozen=True)
 class Scale:
-    """How large everything is.
+    """Sizes of the objects and fits of the tables.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Scale:
 
     @property
     def shrink(self) -> float:
-        """How much smaller than the paper's volumes these are, along a side."""
+        """The factor by which these volumes are smaller than the paper's, along a side."""
         return 1.0 if self.data else self.size / PAPER_SIZE
 
 
@@ -378,7 +378,7 @@ class Cells:
 
 
 def _iterations(path: Path) -> int | None:
-    """How far the fit of a checkpoint has come, or None if the file is missing or damaged."""
+    """Return the iterations that the fit of a checkpoint has done, or None if the file is missing or damaged."""
     try:
         return Checkpoint.load(path).iteration
     except InputError:

@@ -84,7 +84,7 @@ CONTROLS = {
 
 @dataclass(frozen=True)
 class Column:
-    """What a group of rows shows of one cell an object, or what others have published of it."""
+    """Column of a table: one cell of an object in a group of rows, or the value that others have published for it."""
 
     title: str
     cell: Callable[[str], Fit | Volume | None]

@@ -31,7 +31,7 @@ def true_views(views=8, every=360):
 
 
 def measured(ideal, **values):
-    """What a detector with these numbers measures, [T, K] by part."""
+    """Return the measurements of a detector with these numbers, [T, K] by part."""
     varies = {k: 'smooth' for k in values if k != 'curve'} | (dict(curve=2) if 'curve' in values else {})
     response = Response.of(ideal.geometry, highest=2.0, **varies)
     for part in response.parts:
