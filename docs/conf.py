@@ -35,7 +35,7 @@ extensions = [
 ]
 exclude_patterns = ['_ext', 'gallery/**/*.md5', 'gallery/**/*.json', 'gallery/**/*.ipynb', 'gallery/**/*.py']
 
-myst_enable_extensions = ['dollarmath', 'deflist', 'colon_fence', 'attrs_inline', 'attrs_block']
+myst_enable_extensions = ['dollarmath', 'deflist', 'colon_fence']
 myst_heading_anchors = 3
 default_role = 'py:obj'  # `name` links to what it names, where that is documented
 autodoc_typehints = 'signature'
