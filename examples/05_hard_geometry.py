@@ -2,12 +2,12 @@
 A helix with wrong poses
 ========================
 
-The scanner need not move on a circle. Here it climbs along a helix, and every view is off by about a degree and two millimetres,
-of which the fit is told nothing. It corrects the poses while it fits.
+The scanner need not move on a circle. Here it climbs along a helix, and every view is off by about a degree and two
+millimetres. The fit does not know this error. It corrects the poses while it fits.
 """
 
 # %%
-# The scanner that the fit is told: two turns that climb 60 mm each.
+# The nominal scanner, which the fit uses: two turns that climb 60 mm each.
 
 import matplotlib.pyplot as plt
 import numpy as np

@@ -37,7 +37,7 @@ class Step(torch.nn.Module):
         )
 
     def forward(self, x, b):
-        """x [batch, x, y, z], b [batch, view, v, u]; both are those of A / norm(A)"""
+        """x [batch, x, y, z], b [batch, view, v, u]; both in the units of A / norm(A)"""
         x = x - self.size * A.T(A(x) / norm - b) / norm
         return x + self.network(x[:, None])[:, 0]
 

@@ -59,7 +59,7 @@ class CTDetector(mi.Film):
 
     Put it into a `ct_scanner`, whose pixels it takes, or into a camera with a width and a height of its own. `lingo_xray`
     renders it, noise included: its seed is the seed of `mi.render`, and the same seed and view give the same noise in any
-    order. Derivatives are those of the expected signal. Other integrators get an ordinary film (`hdrfilm`, box filter).
+    order. Derivatives are taken of the expected signal. Other integrators get an ordinary film (`hdrfilm`, box filter).
     """
 
     def __init__(self, props):

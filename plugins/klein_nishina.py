@@ -28,11 +28,11 @@ def create(props: mi.Properties) -> mi.PhaseFunction:
        - |string|
        - `count`: the distribution of photons; `energy`: of the energy that they keep. (Default: count)
 
-    With P = 1 / (1 + E / 511 keV (1 - cos theta)), the share of its energy that a photon keeps, the distribution is that of
-    P^2 (P + 1/P - sin^2 theta), for small energies Rayleigh's 3 / (16 pi) (1 + cos^2 theta).
+    With P = 1 / (1 + E / 511 keV (1 - cos theta)), the share of its energy that a photon keeps, the distribution is
+    proportional to P^2 (P + 1/P - sin^2 theta), for small energies Rayleigh's 3 / (16 pi) (1 + cos^2 theta).
 
     It is handed to Mitsuba's own `tabphase`, exact at 8193 cosines and linear between them (less than 2e-6 off up to 799
-    keV); values, densities and samples are those of the same table. A medium does not follow a photon's energy: what follows
+    keV); values, densities and samples come from the same table. A medium does not follow a photon's energy: what follows
     attenuates it like before.
     """
     try:

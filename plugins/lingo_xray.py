@@ -75,11 +75,10 @@ class LingoXray(mi.ad.integrators.common.ADIntegrator):
     detector sees, -ln of the detected signal; docs/effects.md says how. Without them, nothing of their code is compiled.
     The seed of `mi.render` seeds the noise. Derivatives belong to the expected signal.
 
-    Objects overlap additively. A kind of object that a scene lacks adds no code to its kernels. Rays are those of pixel
-    centres (see `pixel`): no random numbers, whatever the sample count. Sensors: `ct_scanner`,
-    `perspective` and `orthographic`, and a `batch` of them, whose views stand side by side in its film. If the film has a
-    crop window, only the window is rendered. Integrals begin at a cone beam's source, and do not end at the panel.
-    Those of a parallel beam are never cut.
+    Objects overlap additively. A kind of object that a scene lacks adds no code to its kernels. Rays go through pixel centres
+    (see `pixel`): no random numbers, whatever the sample count. Sensors: `ct_scanner`, `perspective` and `orthographic`, and a
+    `batch` of them, whose views stand side by side in its film. If the film has a crop window, only the window is rendered.
+    Integrals begin at a cone beam's source, and do not end at the panel. Integrals of a parallel beam are never cut.
 
     Works in `llvm_ad_*` and `cuda_ad_*`, `mono` and `rgb`; not within `dr.freeze`, nor inside `aov` or `moment`, since it
     renders whole images and no single rays. The film gets the image, for `sensor.film().bitmap()`. Gradients reach the

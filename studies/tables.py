@@ -36,7 +36,7 @@ from studies.command import run_study
 def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('table', choices=('views', 'ct', 'ablation', 'controls'))
-    p.add_argument('--objects', nargs='+', metavar='NAME', help='(default: those of the scale)')
+    p.add_argument('--objects', nargs='+', metavar='NAME', help='(default: the objects of the scale)')
     p.add_argument('--scale', choices=('small', 'paper'), default='small', help='see above (default: small)')
     p.add_argument(
         '--finer',

@@ -65,7 +65,7 @@ def phantoms_made_once():
 
 @pytest.fixture
 def sums_in_order(variant) -> None:
-    """Skips where the order of additions is not that of the program."""
+    """Skips if additions are in another order than in the program."""
     if adds_in_any_order():
         pytest.skip('a GPU adds atomically, in any order')
 

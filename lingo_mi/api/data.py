@@ -96,7 +96,7 @@ def simulate(
         scene = load_scene(scene_path(source), {k: str(v) for k, v in (parameters or {}).items()})
         return take_scan(scene, views, seed=seed)
     if parameters:
-        raise InputError('parameters are those of a scene file; this source is none')
+        raise InputError('parameters belong to a scene file, and this source is not one')
     if isinstance(source, Phantom) and geometry is None:
         if held_out is not None:
             raise InputError('held_out needs a geometry: give the scanner of the views to fit, too')

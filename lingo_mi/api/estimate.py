@@ -24,7 +24,7 @@ from lingo_mi.reconstruction.run import mask_images, room_needed, run_algorithm
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.checks import least_memory
 
-EQUAL, CHANGING = (0.7, 1.5), (0.3, 4.0)  # time that the steps to come may take, over that of as many that were tried
+EQUAL, CHANGING = (0.7, 1.5), (0.3, 4.0)  # time of future steps over the time of as many trial steps
 LEAST_STEPS = 3  # of a trial: the first compiles kernels, and does not count
 
 

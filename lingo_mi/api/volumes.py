@@ -108,7 +108,7 @@ def reconstruct(
     cluster : str or Client, optional
         A Dask cluster whose workers make the slabs (default: of 64 slices) and write them to `out`, an .ome.zarr: the scheduler's
         address or file, 'local:N' for N processes of this machine, or a client of `distributed`. Workers must see the folder of
-        `out`. The volume is the same as that of one process. If a worker dies, another makes its slab.
+        `out`. The volume is the same as on one process. If a worker dies, another makes its slab.
     force : bool
         Replace an earlier file.
     progress : bool

@@ -84,7 +84,7 @@ class Drift:
         return not any(self.v[1:]) and not any(self.u[1:])
 
     def panel(self, geometry: Geometry) -> Panel:
-        """The panel in the views of a geometry, which need not be those of the scan, but were taken among them."""
+        """The panel in the views of a geometry. They may be other views than the scan's, taken during the scan."""
         if self.constant:
             return Panel(self.v[0], self.u[0], self.yaw)
         t = scan_times(self.scan, geometry.angles)

@@ -3,9 +3,9 @@
 Every view is predicted from a quick reconstruction of other views (`cross_prediction`), with the views as given, in the opposite
 sense, and in a random order. On sound scans of 20 views or more (of a walnut and a disc with holes, measured, and eight simulated
 objects, over 60 to 360 degrees) a random order makes the differences 2 to 60 times as large, and the opposite sense at least as
-large. Over half a turn of a parallel beam it mirrors the object, so there it is not tried. What the beam drifts by is taken out
-first (`inspection.air`), since it disturbs the comparison. Where the angles are those of other views, a random order makes
-them 0.9 to 1.6 times as large.
+large. Over half a turn of a parallel beam it mirrors the object, so there it is not tried. The beam's drift is removed first
+(`inspection.air`), since it disturbs the comparison. If the angles belong to other views, a random order makes the differences
+0.9 to 1.6 times as large.
 """
 
 from __future__ import annotations

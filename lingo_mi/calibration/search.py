@@ -5,10 +5,10 @@ measured, as a function of the numbers sought, and D the derivatives of r by dif
 reconstructions of its own), a step is a Gauss-Newton step, -(D D^T)^-1 D r. The shift along u is first looked for on
 a grid of trials, a wide one if no minimum is clear.
 
-The panel moves, and the images stay as they were measured. So all pixels count in all trials: if images were moved instead, those
-of an object that reaches over the panel's edge would lose or gain pixels, and the smallest sum would have the fewest.
+The panel moves, and the images stay as they were measured. So all pixels count in all trials: if images were moved instead,
+images of an object that reaches over the panel's edge would lose or gain pixels, and the smallest sum would have the fewest.
 
-Standard errors are those of clustered observations,
+Standard errors are for clustered observations,
 
     K / (K - 1)  (D D^T)^-1  (sum over K clusters of g g^T)  (D D^T)^-1,   g = D r of a cluster
 

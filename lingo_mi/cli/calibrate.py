@@ -78,7 +78,7 @@ def main() -> None:
 
 
 def _inputs(scan: Path) -> list[Path]:
-    """The files that a scan is read from, but for those of a folder."""
+    """The files of a scan that is not a folder."""
     from lingo_mi.files.geometry_file import geometry_file_of, named_files
 
     if scan.suffix != '.npy':

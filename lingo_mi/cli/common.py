@@ -62,7 +62,7 @@ class Parser(argparse.ArgumentParser):
 def guard(main: Callable[[], int | None]) -> None:
     """Run a command's main function and exit: 2 with one line for bad input, 130 after Ctrl-C.
 
-    Warnings become one line each; those of arithmetic are left to the checks of what comes of it.
+    Each warning becomes one line. Warnings of arithmetic are left out, because the results are checked.
     """
     if isinstance(sys.stdout, io.TextIOWrapper):  # names of files need not be text
         sys.stdout.reconfigure(errors='backslashreplace')

@@ -5,11 +5,11 @@
     lingo-mi fit chest --volume my_ct.nii.gz --views 25
     lingo-mi fit foot_50.pickle
 
-The scene says what is scanned and by which scanner; the projections are rendered from its object. A file of measured ones takes
-its place, or with --projections that of the object alone, if a scene's tube and detector are to be modelled. A cloud is
-started from the projections, fitted, and written to the output folder with a report (report.html), a volume in mm
-(volume.nii.gz), the Gaussians (gaussians.ply), a scene of them (result.xml), held-out views and metrics.json. The baselines 3dgs
-and xgaussian make neither volume nor scene; naf makes no Gaussians, and a scene of its volume.
+The scene says what is scanned and by which scanner; the projections are rendered from its object. A file of measured
+projections replaces the scene. With --projections, it replaces only the object, and the scene's tube and detector are modelled.
+A cloud is started from the projections, fitted, and written to the output folder with a report (report.html), a volume in mm
+(volume.nii.gz), the Gaussians (gaussians.ply), a scene of them (result.xml), held-out views and metrics.json. The baselines
+3dgs and xgaussian make neither volume nor scene; naf makes no Gaussians, and a scene of its volume.
 """
 
 import argparse

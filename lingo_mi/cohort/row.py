@@ -136,7 +136,8 @@ def scene_of(folder: Path, geometry: str) -> Path | None:
 
 
 def _files(path, geometry):
-    """All files of a scan: those of a folder; of an .npy without a geometry elsewhere also that beside it, and what it names."""
+    """All files of a scan: the files of a folder, or the file. An .npy without another geometry also has its geometry file and
+    the files named there."""
     if path.is_dir():
         return [file for file in path.rglob('*') if file.is_file() and file.name not in SYSTEM]
     if path.suffix.lower() != '.npy' or geometry is not None:

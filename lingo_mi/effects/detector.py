@@ -7,7 +7,7 @@ For a pixel with transmission T, gain g and open-beam counts I0:
     p = -ln(max(S / g, floor))                    line integral
 
 The floor is half of the smallest nonzero signal (half a count or half a step), so that p is always finite. The noise of an
-energy-integrating panel is slightly larger than that of equally many photons of one energy (its Swank factor is about 0.9).
+energy-integrating panel is slightly larger than the noise of equally many photons of one energy (its Swank factor is about 0.9).
 Therefore `photons` is the number of noise-equivalent quanta.
 
 Random numbers are from Philox4x64 (Salmon et al., SC 2011), a counter-based generator, keyed by seed and view. So the noise of

@@ -66,7 +66,7 @@ class Tube:
     bands : int
         Number of terms for the spectrum.
     parameters : dict
-        The parameters of `of`, by name; those of shapes as material_NAME.
+        The parameters of `of`, by name; the parameters of shapes are called material_NAME.
     """
 
     spectrum: Spectrum

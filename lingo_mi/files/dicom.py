@@ -1,7 +1,7 @@
 """A volume as a DICOM series: CT Image Storage, one file a slice, in Hounsfield units.
 
 The voxels keep their order, so that `read_volume` returns them as they were. x and y of this package run to the patient's right
-and front as in NIfTI, and those of DICOM to the left and back: the image's rows and columns therefore run against its axes.
+and front as in NIfTI, and DICOM's axes to the left and back: the image's rows and columns therefore run against its axes.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ _NRRD_TYPES = {
 }
 _NRRD_PACKINGS = {'raw': None, 'gzip': 'deflate', 'gz': 'deflate', 'bzip2': 'bzip2', 'bz2': 'bzip2'}
 _NRRD_UNITS = {'mm': 1.0, 'um': 1e-3, 'microns': 1e-3, 'micron': 1e-3, 'nm': 1e-6, 'cm': 10.0, 'm': 1e3, '': 1.0}
-# Signs that turn the space's axes into left, posterior, superior; those of others are taken as they are.
+# Signs that turn the space's axes into left, posterior, superior. Axes of other spaces are taken as they are.
 _NRRD_TO_LPS = {
     'right-anterior-superior': (-1, -1, 1),
     'ras': (-1, -1, 1),

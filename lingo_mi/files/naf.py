@@ -13,8 +13,8 @@ Facts of the format, from the generator and the readers that use it:
 
 A pickle is a program. Here it may only build dictionaries, lists, tuples, strings, numbers and numeric
 arrays. The few NumPy names that it may use are replaced by code of this module, so that not even NumPy's own
-functions run. `find_class` of `pickle.Unpickler` alone is not enough: twenty tuples, each of which holds the one before ten
-times, are hashed for ever as the key of a dictionary.
+functions run. `find_class` of `pickle.Unpickler` alone is not enough: twenty tuples that each hold the one before ten times are
+hashed for ever as the key of a dictionary.
 """
 
 from __future__ import annotations

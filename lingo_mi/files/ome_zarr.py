@@ -43,7 +43,7 @@ def read_ome_zarr(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
         axes, level = image['axes'], image['datasets'][0]
         names = [str(axis['name']) for axis in axes]
         folder = path / _below(str(level['path']))
-        everywhere = image.get('coordinateTransformations') or []  # after those of a level
+        everywhere = image.get('coordinateTransformations') or []  # after the transformations of a level
         scale, shift = _placed([*level['coordinateTransformations'], *everywhere], len(names))
         units = [MILLIMETRES[axis.get('unit')] for axis in axes if axis['name'] in SPACE]
     except (KeyError, IndexError, TypeError, ValueError, AttributeError, OverflowError):

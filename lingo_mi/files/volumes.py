@@ -322,7 +322,7 @@ def write_volume(path: PathLike | str, data: np.ndarray, grid: Grid, description
 def volume_header(path: PathLike | str, grid: Grid, description: str) -> bytes:
     """Return the header of the file that `write_volume` writes. The voxels follow it as little-endian float32, x fastest.
 
-    The arguments and errors are those of `write_volume`.
+    The arguments and errors are the same as for `write_volume`.
     """
     import nibabel
 

@@ -52,7 +52,7 @@ class Checkpoint:
         All parameters, their moments, the densification statistic.
     arrays : dict
         By name: `initial`, the points that the fit started from, float32 [M, 3]; `order`, the views that come next;
-        `losses`, those of the last pass; the mean of the last steps; and those of the corrections.
+        `losses`, the losses of the last pass; the mean of the last steps; and the arrays of the corrections.
     seed : int
         Seed of all random choices.
     rng : dict
@@ -219,7 +219,7 @@ def _array(file: io.BufferedReader, entry: zipfile.ZipInfo) -> np.ndarray:
 
 
 def checksum_of(sums: Iterable[tuple[str, int]]) -> str:
-    """One sum over those of all entries, by name."""
+    """One checksum of the checksums of all entries, by name."""
     return hashlib.blake2b(json.dumps(sorted(sums)).encode(), digest_size=16).hexdigest()
 
 

@@ -140,7 +140,7 @@ def _require_plain(plain: Any) -> tuple[Method, Geometry]:
         geometry = read_scanner(plain['scanner'])[0]
     except InputError as error:
         raise InputError(f'in its settings or its scanner, {error}') from None
-    _require(method.flat().keys() == settings.keys(), f'its settings are not all of those of {plain["method"]}')
+    _require(method.flat().keys() == settings.keys(), f'it lacks settings of {plain["method"]}, or has others')
     views, seen, iteration = len(geometry), plain['seen'], plain['iteration']
     _require(plain['scan']['views'] == views, f'views is {shown(plain["scan"]["views"])}, but the scanner has {views}')
     _require(seen <= views, f'seen is {shown(seen)}, but the scanner has {views} views')

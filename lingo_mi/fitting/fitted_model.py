@@ -123,8 +123,8 @@ class FittedModel:
 
     @drjit_lock()
     def expected(self, geometry: Geometry) -> np.ndarray:
-        """Return the values that the scan's detector is expected to measure, float32 [view, v, u]. The views were taken among
-        the views of the scan.
+        """Return the values that the scan's detector is expected to measure, float32 [view, v, u]. The views were taken during
+        the scan.
 
         That is `render`, with the response and with the smooth corrections of poses that were fitted, for the time of the views.
         """

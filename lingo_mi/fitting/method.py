@@ -189,7 +189,7 @@ class Stepper(ABC):
         return self.geometry
 
     def between(self, geometry: Geometry) -> Geometry:
-        """A geometry of views that were taken among those of the scan, with corrections for their time."""
+        """A geometry with corrections for the time of its views, which were taken during the scan."""
         return geometry
 
     def arrays(self) -> dict[str, np.ndarray]:

@@ -7,7 +7,7 @@ which are predicted better and better long after the volume has become worse. It
 
 So there are two fits, each from its start. The first, the search, sees all views but some, and ends once these are predicted no
 better. The second sees all views, and ends at the step that was best in the search, with the rates of a fit that would not end
-there. Its steps are those of a fit without a search. After Golub, Heath and Wahba, Technometrics 21, 1979.
+there. Its steps are the same as without a search. After Golub, Heath and Wahba, Technometrics 21, 1979.
 """
 
 from __future__ import annotations

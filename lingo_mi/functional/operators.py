@@ -99,8 +99,8 @@ def project(
         The scan. Rays run from the source through the pixel centres and beyond, so a virtual panel may be inside the object
         (DSD = DSO). Rays of a parallel beam begin and end at infinity.
     extent : float or None
-        Cut-off in standard deviations, 1 to 20 (default: that of `gaussians`, or 5 for arrays). With 5, images have an error of
-        2e-6 and derivatives of 4e-5 (relative L2 norms, docs/accuracy.md).
+        Cut-off in standard deviations, 1 to 20 (default: the cut-off of `gaussians`, or 5 for arrays). With 5, images have an
+        error of 2e-6 and derivatives of 4e-5 (relative L2 norms, docs/accuracy.md).
     views : Iterable[int] or None
         Indices of the views to project, n of them; None for all.
     rays

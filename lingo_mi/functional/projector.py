@@ -142,7 +142,7 @@ class Projector(LinearMap):
         Returns
         -------
         array
-            The projections. With rays, they are those of a scan with these poses.
+            The projections. With rays, they are the projections of a scan with these poses.
 
         Raises
         ------
@@ -152,10 +152,10 @@ class Projector(LinearMap):
 
         Notes
         -----
-        Derivatives with respect to the rays are those of the model, and at kinks of its interpolation the mean of both sides.
-        They do not contain the jumps of Joseph's model. This model jumps if a sample enters the box and the volume is not zero at
-        its faces, if the main axis of a ray changes, and, for a ray of a cone that is steeper than 45 degrees in voxels, if the
-        panel begins to lean. If these jumps matter, use `model='exact'`, which has none.
+        Derivatives with respect to the rays are exact for the model. At kinks of its interpolation they are the mean of both
+        sides. They do not contain the jumps of Joseph's model. This model jumps if a sample enters the box and the volume is
+        not zero at its faces, if the main axis of a ray changes, and, for a ray of a cone that is steeper than 45 degrees in
+        voxels, if the panel begins to lean. If these jumps matter, use `model='exact'`, which has none.
 
         Examples
         --------

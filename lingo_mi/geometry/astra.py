@@ -44,7 +44,7 @@ VECTORS = {
     'parallel3d_vec': 'parallel',
     'cyl_cone_vec': 'cone',
 }  # of scans with a pose for every view
-# Types of two dimensions, and those of three that they are with one row.
+# Types of two dimensions, and the same types in three dimensions with one row.
 IN_PLANE = {'fanflat': 'cone', 'parallel': 'parallel3d', 'fanflat_vec': 'cone_vec', 'parallel_vec': 'parallel3d_vec'}
 
 

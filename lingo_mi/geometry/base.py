@@ -171,7 +171,7 @@ class Geometry(ABC):
     def parallel(
         cls, *, nDetector: ArrayLike, dDetector: ArrayLike, angles: ArrayLike, **placement: Unpack[Placement]
     ) -> Geometry:
-        """A parallel beam that turns about z. The parameters are those of `cone`, without the distances.
+        """A parallel beam that turns about z. The parameters are the same as for `cone`, without the distances.
 
         rotDetector does not turn its beam.
 
@@ -341,7 +341,7 @@ class Geometry(ABC):
         """
 
     def joined(self, other: Geometry) -> Geometry:
-        """The views of this scan, then those of another with as many pixels, on this scan's grid.
+        """The views of this scan, then the views of another with as many pixels, on this scan's grid.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""A scan whose source moves on a circle, and whether poses are those of one."""
+"""A scan whose source moves on a circle, and a test whether poses are on one."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ class CircularGeometry(Geometry):
         return replace(self, angles=self.angles[checked_views(index, len(self))])
 
     def joined(self, other: Geometry) -> Geometry:
-        """The views of this scan, then those of another: see `Geometry.joined`."""
+        """The views of this scan, then the views of another: see `Geometry.joined`."""
         same = 'mode', 'DSO', 'DSD', 'nDetector', 'dDetector', 'offDetector'
         if isinstance(other, CircularGeometry) and all(getattr(self, name) == getattr(other, name) for name in same):
             return replace(self, angles=np.concatenate([self.angles, other.angles]))

@@ -101,7 +101,7 @@ class CurvedGeometry(Geometry):
         return replace(self, flat=self.flat.on(grid))
 
     def joined(self, other: Geometry) -> CurvedGeometry:
-        """The views of this scan, then those of another whose panel has the same pixels and radius.
+        """The views of this scan, then the views of another whose panel has the same pixels and radius.
 
         Raises
         ------

@@ -85,7 +85,7 @@ def rotation(axis: str, angle: ArrayLike) -> np.ndarray:
 class Motion(TypedDict, total=False):
     """Motions of a scanner's source and panel off the plain circle, once, or for every view with a first axis of n.
 
-    All are 0 by default. The order of the rotations is that of TIGRE (`computeDeltas_Siddon` in its CUDA code). TIGRE writes
+    All are 0 by default. Rotations are in TIGRE's order (`computeDeltas_Siddon` in its CUDA code). TIGRE writes
     `height` as a per-view `offOrigin`, and `tilt` as the second Euler angle with the opposite sign. rotDetector does not turn the
     beam of a parallel scan.
 

@@ -349,7 +349,8 @@ def _reaches(outer, air, limit):
 
 
 def _air_spread(p, limit):
-    """Standard deviation of the views' air levels, those of pixels near the sides that are below the limit, without its noise."""
+    """Standard deviation of the views' air levels, without noise. A level is the mean of the pixels near the sides that are
+    below the limit."""
     edge = max(1, p.shape[2] // 64)
     near = np.concatenate([p[:, :, :edge], p[:, :, -edge:]], 2).reshape(len(p), -1)
     air = [air_values for view in near if (air_values := view[view < limit]).size > 8]
@@ -465,6 +466,6 @@ def _orbit(scan, air, suspects):
 def _turn(geometry):
     """Radians from the first view to one after the last."""
     span = np.ptp(geometry.angles)
-    if span <= 2 * np.pi:  # those of poses jump from pi to -pi
+    if span <= 2 * np.pi:  # angles of poses jump from pi to -pi
         span = min(span, np.ptp(np.unwrap(geometry.angles)))
     return float(span * len(geometry) / (len(geometry) - 1))

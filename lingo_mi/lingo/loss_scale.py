@@ -84,7 +84,7 @@ def _count(image, low, high, lane, lanes, target):
 def _best_bin(histogram):
     """The last bin of the lower class. Computed in one lane: 256 steps cost less than launching another kernel.
 
-    Let n be the number of pixels and s the sum of their bin numbers; n1 and s1 are those of the lower class. Then the
+    Let n be the number of pixels and s the sum of their bin numbers; n1 and s1 are the same numbers for the lower class. Then the
     variance between the classes is (n s1 - n1 s)^2 / (n1 (n - n1)), up to a constant factor.
     """
     Float64: Any = dr.float64_array_t(mi.Float)

@@ -23,7 +23,7 @@ def occupancy(
     """P = count(low valid cells of a coarse grid) / V^3, in [0, 1], with V = `resolution`.
 
     An axis with fewer than V voxels keeps them (a single slice stays one cell thick), and the count is
-    divided by the actual number of cells. The other arguments are those of `valid_voxels`.
+    divided by the actual number of cells. The other arguments are the same as for `valid_voxels`.
     """
     coarse = np.minimum(resolution, shape)
     low, _ = valid_voxels(rays, masks, coarse, half, misses, outside)

@@ -58,7 +58,7 @@ class UniformEllipsoids:
     def project(self, geometry: Geometry) -> np.ndarray:
         """Exact line integrals, float32 [view, v, u], density times mm (computed in float64).
 
-        Chords are those of the whole line, so source and panel must lie outside the object.
+        Chords are along the whole line, so source and panel must lie outside the object.
         """
         rays = geometry.rays()
         nv, nu = geometry.nDetector

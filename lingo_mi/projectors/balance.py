@@ -132,7 +132,7 @@ class Sharing:
 
     @property
     def reading(self) -> Layout:
-        """The layout of kernels that read from an image. Its steps are as wide as those of `adding`."""
+        """The layout of kernels that read from an image. Its steps are as wide as the steps of `adding`."""
         return self.adding if _on_cpu() else PAIRS
 
     @property
@@ -146,7 +146,7 @@ class Sharing:
 
     @property
     def block(self) -> int:
-        """Rows of a block: at least those of a team."""
+        """Rows of a block, at least as many as a team has."""
         return self.reading.rows
 
     def blocks(self, rows: Any) -> Any:
@@ -168,7 +168,7 @@ class Share:
     Parameters
     ----------
     lane : UInt32
-        Lane numbers; those of a team are consecutive.
+        Lane numbers; a team has consecutive ones.
     begin, end : tuple
         Of the team's share, as (item, block), UInt32.
     blocks : UInt32 [N]

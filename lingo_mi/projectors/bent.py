@@ -109,7 +109,7 @@ class Bend:
         return x, self.foot + scale * (mi.Float64(v) + 0.5 - self.foot)
 
     def position(self, x: Any, y: Any) -> tuple[Any, Any]:
-        """(X, Y) of any positions on the panel, Float64: those of `Curve.on_plane`."""
+        """(X, Y) of any positions on the panel, Float64, as by `Curve.on_plane`."""
         radius, middle, foot_u, foot_v, distance = self._numbers()
         angle = (mi.Float64(x) - middle) / radius
         scale = distance / (distance - radius * (1 - dr.cos(angle)))

@@ -68,7 +68,7 @@ class Footprints:
     width : Float [N]
         Pixels across the widest row, for balancing work.
     area : Float [N]
-        Covered pixels: those of the ellipse or of the box, whichever are fewer.
+        Covered pixels: the pixels of the ellipse or of the box, whichever are fewer.
     straddles : Bool [N]
         Gaussians without a footprint, which `segment` must integrate; also invalid ones (a number that is not finite, or a zero
         scale or quaternion).

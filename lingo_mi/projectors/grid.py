@@ -245,7 +245,7 @@ def line_integrals(data: Any, size: Sequence[int], box_min: Any, box_max: Any, l
     object
         Mi.Float [lines], density times length: exact for the trilinear interpolant, zero for a ray that misses the box.
         Differentiable with respect to `data` in both modes (the derivative is the same operator or its transpose), not with
-        respect to the rays. For full float32 precision, origins should be near the box, as those of `view_rays` are.
+        respect to the rays. For full float32 precision, origins should be near the box, as by `view_rays`.
 
     Raises
     ------

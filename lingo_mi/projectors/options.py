@@ -47,7 +47,7 @@ class RenderOptions:
     def of(
         accuracy: Any = 'default', extent: Any = None, footprint: Any = 'exact', pixel: Any = 'centre'
     ) -> RenderOptions:
-        """The options from plugin parameters. extent=None: that of the preset `accuracy`. Raises InputError."""
+        """The options from plugin parameters. extent=None means the cut-off of the preset `accuracy`. Raises InputError."""
         if accuracy not in cutoff.PRESETS:
             raise InputError(f'lingo_xray: accuracy is one of {", ".join(cutoff.PRESETS)}, not {accuracy!r}')
         extent = cutoff.PRESETS[accuracy] if extent is None else extent

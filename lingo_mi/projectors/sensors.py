@@ -13,7 +13,7 @@ from lingo_mi.projectors.view import View
 
 
 def views_of(sensor: Any) -> list[tuple[Any, View]]:
-    """The sensors within a `mi.Sensor` and their rays: those of a `batch` from left to right, of any other the sensor itself.
+    """The sensors within a `mi.Sensor` and their rays: the sensors of a `batch` from left to right, or the sensor itself.
 
     Mitsuba gives each sensor of a batch a film of the size of its part.
 
@@ -32,7 +32,7 @@ def views_of(sensor: Any) -> list[tuple[Any, View]]:
 def view_of(sensor: Any) -> View:
     """The rays through the pixel centres of the film of a flat `mi.Sensor`.
 
-    Supports `ct_scanner`, `perspective` (with principal point offsets) and `orthographic`. Pixels are those of the film's crop
+    Supports `ct_scanner`, `perspective` (with principal point offsets) and `orthographic`. Pixels belong to the film's crop
     window.
 
     Raises

@@ -118,7 +118,7 @@ class Stack:
         return uploaded(np.asarray(projections).transpose(0, 2, 1))
 
     def select(self, images: Any, views: Views) -> Any:
-        """The images of the views `views` out of those of all views."""
+        """The images of the views `views` out of the images of all views."""
         view, u, v = self.pixels_of(Block.of(views))
         return dr.gather(mi.Float, images, (view * self.panel[1] + u) * self.panel[0] + v)
 

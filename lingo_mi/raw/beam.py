@@ -26,7 +26,7 @@ class Beam:
     air : tuple[int, int, int, int] or None
         (v0, v1, u0, u1): pixels whose mean is the air level of a view.
     percentile : float or None
-        Instead: that of its pixels is.
+        Percentile of a view's pixels that is its air level, in place of `air`.
     limit : float
         Counts from here on are not valid.
     """

@@ -1,4 +1,4 @@
-"""Frames in DICOM files: those of angiography (`dicom_xa`), and projections of a CT scanner (`dicom_ct_pd`)."""
+"""Frames in DICOM files: frames of angiography (`dicom_xa`), and projections of a CT scanner (`dicom_ct_pd`)."""
 
 from __future__ import annotations
 

@@ -7,8 +7,8 @@ geometry is in private attributes. In cylindrical coordinates (rho, phi, z), a p
 
     (-\rho \sin \phi, \; \rho \cos \phi, \; z)
 
-The panel is built around its focal centre, at (rho, phi, z), and the focal spot is elsewhere by the source's shifts where it
-flies. Elements are counted from 1. As seen from the focal centre, those of a row run to the left, towards growing phi, and rows
+The panel is built around its focal centre, at (rho, phi, z), and a flying focal spot is displaced by the source's shifts.
+Elements are counted from 1. As seen from the focal centre, the elements of a row run to the left, towards growing phi, and rows
 run down, towards -z. Stored images have the panel's columns as rows.
 
 Chen et al., "Development and validation of an open data format for CT projection data", Medical Physics 42 (2015), 6964; Moen et

@@ -55,8 +55,8 @@ class Fields:
 def fields(shape: tuple[int, int], flats: Frames | None, darks: Frames | None, saturation: float = np.inf) -> Fields:
     """The mean dark and flat field, the pixels that are good, and the photons of a pixel.
 
-    Photons are those of a Poisson signal of the same scatter: mean^2 / variance of a pixel over the flats, each divided by its
-    brightness first. A pixel that reaches `saturation`, in counts, in a flat is not good.
+    The photons are the number whose Poisson noise has the same scatter: mean^2 / variance of a pixel over the flats, each
+    divided by its brightness first. A pixel that reaches `saturation`, in counts, in a flat is not good.
 
     Raises
     ------

@@ -1,8 +1,8 @@
 """The .nsipro of North Star Imaging: where source, panel and axis are, as vectors from a point of the axis.
 
 Its lines are `<name>value`, in sections `<Section>` to `</Section>`. The reference is the centre of the first pixel, the normal
-points from the source to the panel, the horizontal along its rows, and columns run along normal x horizontal. These facts are
-those of MBIRJAX's reader (`mbirjax.preprocess.nsi`).
+points from the source to the panel, the horizontal along its rows, and columns run along normal x horizontal. These facts come
+from MBIRJAX's reader (`mbirjax.preprocess.nsi`).
 """
 
 from __future__ import annotations

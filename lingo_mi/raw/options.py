@@ -20,7 +20,7 @@ class Options:
     Parameters
     ----------
     flats, darks : path-like or None
-        Files or folders of their own; None: those of the recording, if it has any.
+        Files or folders of their own; None: the fields of the recording, if it has any.
     air : tuple[int, int, int, int] or None
         (v0, v1, u0, u1), pixels of the whole frame where no view has an object: their mean is the air level of a view.
     percentile : float or None

@@ -77,7 +77,7 @@ class Taken:
     scanner : dict or Geometry
         By the names of `lingo_mi.files.scanner_dict`, without voxels: mm, degrees; or a Geometry, whose voxels do not count.
     columns, rows : int
-        -1 if columns or rows run the other way than those of `scanner`, else 1.
+        -1 if columns or rows run the other way than in `scanner`, else 1.
     white : float or None
         Counts of the unattenuated beam, dark ones included.
     """

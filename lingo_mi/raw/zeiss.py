@@ -1,6 +1,6 @@
 """The .txrm and .xrm of Zeiss' Xradia microscopes: frames, their reference, and where they were taken, in an OLE2 container.
 
-The names are those of `dxchange.read_txrm`; distances are in mm and PixelSize, at the axis, in micrometres.
+The names are the same as in `dxchange.read_txrm`. Distances are in mm; PixelSize, at the axis, is in micrometres.
 """
 
 from __future__ import annotations

@@ -210,7 +210,7 @@ class Best(Algorithm):
     def _run(
         self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None, fit: Fit | None = None
     ) -> Chosen:
-        """Reconstruct the volume of a scan, see `run_algorithm`. The residuals are those of the last refinement.
+        """Reconstruct the volume of a scan, see `run_algorithm`. The residuals belong to the last refinement.
 
         Parameters
         ----------

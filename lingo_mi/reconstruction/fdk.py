@@ -398,7 +398,8 @@ def _weighted(scan: Scan) -> tuple[Callable[[int], np.ndarray], CircularGeometry
 def backprojected(
     geometry: CircularGeometry, images: Callable[[int], np.ndarray], progress: Progress | None
 ) -> np.ndarray:
-    """The volume [x, y, z] of filtered projections. images: gives those of a batch, [view, u, v], by its first view."""
+    """The volume [x, y, z] of filtered projections. images: gives the filtered projections of a batch, [view, u, v], by its
+    first view."""
     volume = dr.zeros(mi.Float, int(np.prod(geometry.grid.shape)))
     dr.make_opaque(volume)
     matrices, weights = geometry.voxel_matrices(), view_weights(geometry)

@@ -110,7 +110,7 @@ class Refined(Algorithm):
         sample: Callable[[Grid], np.ndarray] | None = None,
         completed: Scan | None = None,
     ) -> Reconstruction:
-        """Reconstruct the volume from measured projections. The residuals are those of the measured views.
+        """Reconstruct the volume from measured projections. The residuals belong to the measured views.
 
         Parameters
         ----------

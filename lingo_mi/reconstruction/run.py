@@ -160,7 +160,7 @@ def progress_bar(
     label : str or None
         Before the bar (default: the algorithm's name).
     steps : int or None
-        In all (default: those of `run_algorithm`).
+        Number of all steps (default: the steps of `run_algorithm`).
     shown : bool
         False: draw nothing.
 

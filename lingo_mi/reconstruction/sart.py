@@ -84,7 +84,7 @@ def blocks(angles: np.ndarray, blocksize: int, order: str, rng: np.random.Genera
 def passes(angles: np.ndarray, blocksize: int, order: str, seed: int) -> Iterator[list[np.ndarray]]:
     """The `blocks` of pass after pass, an endless iterator."""
     rng = np.random.default_rng(seed)
-    # The first draw of a seed is skipped: the published numbers are those of the orders that follow it.
+    # The first draw of a seed is skipped: the published numbers belong to the orders that follow it.
     blocks(angles, blocksize, order, rng)
     while True:
         yield blocks(angles, blocksize, order, rng)

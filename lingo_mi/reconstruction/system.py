@@ -92,7 +92,7 @@ class System:
         return r, self.relative(r)
 
     def relative(self, r: mi.Float) -> float:
-        """The norm of a residual over that of b.
+        """The norm of a residual over the norm of b.
 
         Raises
         ------

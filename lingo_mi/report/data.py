@@ -29,10 +29,10 @@ class ReportData:
     title           of the report: any text, shown as it is, on one line of printable characters
     metrics         the numbers, by the keys of QUALITY and SETTINGS. None and NaN are left out; other scalar
                     entries are listed with the settings. `history` is a list of dicts with `iteration`,
-                    `seconds`, `loss`, `psnr_2d`, `psnr_3d` and `gaussians`, each of which may be missing or None.
+                    `seconds`, `loss`, `psnr_2d`, `psnr_3d` and `gaussians`; each may be missing or None.
                     `residual_by_view` is a list of the residual of each of `views`, rms
     volume          [x, y, z] density, 1/mm or on X3D's scale (`quantity`); None for a cloud without densities
-    shape           its voxels, (x, y, z); by default those of `volume`
+    shape           its voxels, (x, y, z); by default the shape of `volume`
     spacing         voxel size, (x, y, z), mm
     truth           the true volume, as `volume`; None for measured data
     preview         n, if each voxel of `volume` and `truth` is the mean of n^3 of the grid that `shape` and `spacing` describe

@@ -45,7 +45,7 @@ QUALITY = {
     ),
     'psnr_3d_r2': Number(
         'PSNR 3D as in R2-Gaussian: peak 1', 'dB', '.2f',
-        'To compare with published tables. Only for densities that reach 1: those of a dim object look better than they are.',
+        'To compare with published tables. Only for densities that reach 1: a dim object looks better than it is.',
     ),
     'ssim_3d_r2': Number(
         'SSIM 3D as in R2-Gaussian: mean over the slices of the three axes, full scale 1', '', '.4f',
@@ -75,7 +75,7 @@ QUALITY = {
     'seconds_init': Number('Time to initialise', 's', '.2f', 'From projections to the initial cloud.'),
     'seconds_fit': Number('Time to fit', 's', '.1f', 'All steps, without the measurements in between.'),
     'ms_per_iteration': Number(
-        'Time per iteration', 'ms', '.2f', 'The time to fit, divided by the iterations, those of a search included.'
+        'Time per iteration', 'ms', '.2f', 'The time to fit, divided by the iterations, including a search.'
     ),
 }  # fmt: skip
 SETTINGS = {
@@ -95,7 +95,7 @@ SETTINGS = {
         "LINGO's parts",
         '',
         '',
-        'Otsu masks and the voxels that lie in those of all views, where Gaussians start; the factor on the loss.',
+        'Otsu masks, and the voxels in the masks of all views, in which Gaussians start; the factor on the loss.',
     ),
     'seed': Number('Seed', '', '', 'Of every random choice; the same seed gives the same result.'),
     'variant': Number('Mitsuba variant', '', '', 'CPU or GPU.'),

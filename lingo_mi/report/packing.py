@@ -34,7 +34,7 @@ class Packed:
 
 
 class Arrays(dict[str, Packed]):
-    """The arrays of a page by name. Given those of an earlier state of it, what has not changed since is not packed again."""
+    """The arrays of a page by name. Arrays that have not changed since an earlier state of the page are not packed again."""
 
     def __init__(self, earlier: Arrays | None = None):
         super().__init__()

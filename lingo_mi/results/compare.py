@@ -121,7 +121,7 @@ def compare_page(results: Sequence[tuple[str, Fit | VolumeFile]], truth: Volume 
                 )
             if name != 'Truth' and not np.allclose(volume.affine, first.affine, atol=0.01 * max(first.spacing)):
                 raise InputError(
-                    f'{name}: its voxels lie elsewhere than those of {next(iter(volumes))}: results that are compared need '
+                    f'{name}: its voxels lie elsewhere than the voxels of {next(iter(volumes))}: results that are compared need '
                     'one grid; fit or reconstruct again with the same scanner'
                 )
         middle = first.affine[:3, :3] @ ((np.array(first.data.shape) - 1) / 2) + first.affine[:3, 3]

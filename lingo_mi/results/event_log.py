@@ -25,7 +25,7 @@ class EventLog:
     """
 
     def __init__(self, folder: PathLike | str):
-        """folder: is created if missing; a run's events are a file there, beside those of earlier runs."""
+        """folder: is created if missing; a run's events are a file there, beside the files of earlier runs."""
         library = optional('tensorboardX', 'tensorboard')
         path: Path = as_path('log_dir', folder)
         with writing(path):
@@ -36,7 +36,7 @@ class EventLog:
         self._pictures: list[tuple[str, np.ndarray]] = []  # of the step that `step` tells of next
 
     def search(self, iteration: int, held_out: float) -> None:
-        """See `watch.Watcher`. Its steps are not those of the fit: nothing is written."""
+        """See `watch.Watcher`. Its steps are not steps of the fit: nothing is written."""
 
     def step(self, entry: dict, total: int) -> None:
         """See `watch.Watcher`."""

@@ -121,7 +121,7 @@ class Live:
         return time.perf_counter() - self._asked < PATIENCE
 
     def _show(self, fit: Fit) -> None:
-        began, self._waiting = time.process_time(), None  # of all threads: a volume is made by those of Dr.Jit
+        began, self._waiting = time.process_time(), None  # of all threads: Dr.Jit's threads make the volume
         data = self._contents(fit)
         with self._lock:
             self._data, self._number = data, self._number + 1

@@ -110,7 +110,7 @@ def remove_others(folder: Path, names: Iterable[str]) -> None:
 
 
 def complete_result(folder: Path, names: Iterable[str], numbers: dict, default: Callable | None = None) -> dict:
-    """Write metrics.json, which marks a whole result of those of these files that exist.
+    """Write metrics.json, which marks the existing files of these as a whole result.
 
     Parameters
     ----------

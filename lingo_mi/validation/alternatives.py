@@ -148,9 +148,9 @@ def _march(texture, origin, d, first, last, step, half):
 class Tree:
     """Marching through the tree of an `ellipsoids` shape, hit by hit, by `o = si.p + epsilon d`.
 
-    A hit is where a ray enters an ellipsoid, so two ellipsoids that are entered within epsilon count once, and rounding
-    of the hit's position may count one twice. Derivatives are those of the closed form at the hits that were found, by a
-    second walk.
+    A hit is the point at which a ray enters an ellipsoid, so two ellipsoids that are entered within epsilon count once, and
+    rounding of the hit's position may count one twice. A second walk takes the derivatives of the closed form at the hits that
+    were found.
     """
 
     def __init__(self, data: Any, density: Any, extent: float, epsilon: float):

@@ -86,8 +86,8 @@ def predicted(part: str, card: Card, gaussians: int, boxes: float) -> float:
     Parameters
     ----------
     boxes : float
-        Pairs of a Gaussian and a pixel of its box (`pairs.count_pairs`): the largest kernels take time in their proportion, the
-        others in that of the Gaussians.
+        Pairs of a Gaussian and a pixel of its box (`pairs.count_pairs`): the time of the largest kernels is in proportion to
+        them, the time of the others to the Gaussians.
     """
     foot = counts()['foot']
     per_pair, per_gaussian = boxes / foot['boxes'], gaussians / foot['gaussians']

@@ -3,7 +3,8 @@
 The function is L = sum(weights * image) with fixed random weights, normal about zero. Its derivatives by automatic
 differentiation are compared with
 
-- `ellipsoids`: central differences of the closed form in float64 NumPy, since those of a float32 image are mostly rounding; the
+- `ellipsoids`: central differences of the closed form in float64 NumPy, since differences of a float32 image are mostly
+rounding; the
   cut-off is set to 8 standard deviations, because the closed form has none
 - `grids`: the image of one voxel of density 1 in an empty grid, minus one of the empty grid: integrals are linear in a grid, so
   the only error of this large step is rounding

@@ -1,12 +1,12 @@
-"""The operator `Projector` and its transpose beside those of other packages, and what a call costs beyond its kernel.
+"""The operator `Projector` and its transpose beside other packages, and the cost of a call beyond its kernel.
 
     python -m studies.benchmarks.operator --out docs/tables
     python -m studies.benchmarks.operator --overhead
 
 A cone beam of one turn before a flat panel. Every package that is installed is measured in the same process, from an array of
-NumPy to an array of NumPy. CPU seconds are those of all threads of the process: they say what a call costs, even where others use
-the machine. The first call, which compiles, is not counted. Packages that take seconds a view are called once on one view, and
-the seconds are scaled to all. The adjoint's error is |<A x, y> - <x, A.T y>| / (|A x| |y|) for random x and y, in float64.
+NumPy to an array of NumPy. CPU seconds are summed over all threads of the process: they give the cost of a call even if others
+use the machine. The first call, which compiles, is not counted. Packages that take seconds a view are called once on one view,
+and the seconds are scaled to all. The adjoint's error is |<A x, y> - <x, A.T y>| / (|A x| |y|) for random x and y, in float64.
 
 `--overhead` takes a scan so small that its kernels take about a millisecond, in one thread. It compares calls through arrays of
 NumPy, Dr.Jit, PyTorch and JAX with the bare kernels: the least CPU seconds over all turns, since others on the machine hardly

@@ -63,7 +63,7 @@ def difference(more: dict, less: dict) -> dict:
 
 
 def counted(stand_in: str, cloud: str) -> dict:
-    """Sizes, and the kernels of an image and of its derivatives; of a fit's checkpoint also those of a step."""
+    """Sizes, and the kernels of an image and of its derivatives. A fit's checkpoint also has the kernels of a step."""
     sizes, _ = profiled(stand_in, cloud, 'sizes')
     image, both = (profiled(stand_in, cloud, part)[1] for part in ('image', 'derivatives'))
     out = json.loads(sizes) | dict(image=list(image.values()), derivatives=list(difference(both, image).values()))

@@ -36,7 +36,7 @@ class Experiment:
     title : str
         In tables and pictures.
     model : dict
-        Options of the fit that models it, besides those of the others.
+        Options of the fit that models it, besides the options of the others.
     scene : dict
         Parameters of the scene by fit, where these differ; volumes are compared in the middle that all fits have.
     turn, shift : float

@@ -46,7 +46,7 @@ ROWS = {
     'scatter': ('scatter',),
 }
 NOTHING = 'no error of measurement (simulated)'
-# Corrections that a fit finds with the cloud, beside those of the rows above.
+# Corrections that a fit finds with the cloud, beside the corrections of the rows above.
 WITH_CLOUD = {
     'as given': {},
     'air level of every view': dict(fit_air='view'),

@@ -4,8 +4,8 @@
     python -m studies.growth --large --docs docs
 
 Stages are the initial cloud of `fast`, a step, sampling the cloud on voxels, FDK, a pass of SART, the measures of quality, and
-the files. One quantity grows at a time, from 64 voxels and 128 pixels a side, 20 views and 10,000 Gaussians. Times are those of
-the CPU, user and system, so that other work on the machine does not count. On Linux, and without a GPU.
+the files. One quantity grows at a time, from 64 voxels and 128 pixels a side, 20 views and 10,000 Gaussians. Times are CPU
+times, user and system, so that other work on the machine does not count. On Linux, and without a GPU.
 
 Takes a few minutes, with --large half an hour. Writes growth.json, growth.md and growth.png to --out. Every stage is stored
 when it is done; the same command goes on with what is missing, and measures again what another commit or machine has given.

@@ -110,7 +110,7 @@ def _step(size: Size):
         dr.sync_thread()
 
     step()
-    step()  # the second step's kernels are those of all others
+    step()  # all later steps have the second step's kernels
     return step
 
 

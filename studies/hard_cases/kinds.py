@@ -26,7 +26,7 @@ class ViewCase:
     warned : bool
         Whether an AccuracyWarning must come with it.
     analytic : bool
-        Whether derivatives are compared with those of `closed_form`, since differences of the oracle's float64 are too coarse;
+        Whether derivatives are compared with `closed_form`, since differences of the oracle's float64 are too coarse;
         only for Gaussians far from the ends of the rays.
     note : str
         What limits the accuracy, where it is less than usual.
@@ -46,7 +46,7 @@ class ViewCase:
 
 @dataclass(frozen=True)
 class VoxelCase:
-    """A cloud on a grid of voxels. The errors are those of the densities at the voxels' centres."""
+    """A cloud on a grid of voxels. The errors are errors of the densities at the voxels' centres."""
 
     name: str
     cloud: Cloud

@@ -1,4 +1,4 @@
-"""The Markdown page of the hard cases, and their results in a file, so that a page can show those of two variants."""
+"""The Markdown page of the hard cases, and their results in a file, so that a page can show the results of two variants."""
 
 from __future__ import annotations
 
@@ -98,7 +98,9 @@ def markdown(results: Sequence[tuple], beside: Stored | None = None) -> str:
         titles[-2:-2] = [f'derivatives, {beside.title}']
     lines = [INTRODUCTION, f'| {" | ".join(titles)} |', '|---' * len(titles) + '|']
     if beside:
-        lines[1:1] = [f'Columns of {beside.title} are those of `{beside.variant}`, of derivatives the worst kind.\n']
+        lines[1:1] = [
+            f'Columns of {beside.title} belong to `{beside.variant}`; of derivatives, they show the worst kind.\n'
+        ]
     misses = beside.misses([case for case, _ in results]) if beside else {}
     for case, result in results:
         limits = [None] * 2 if result.image is None else [case.image, case.gradient]

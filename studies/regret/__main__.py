@@ -8,7 +8,7 @@ Simulated scans are cone beams over a full turn, with 4 as the largest line inte
 a side as are reconstructed. Settings are ASD-POCS, and the refinement of `best` with 20 passes on the scan's voxels and on half
 their size; with --clouds, which takes minutes a scan, also the volume of a cloud and what starts from it. Each is stored when it
 is done; the same command goes on after an interruption. The table, as Markdown, is renewed after each, with its provenance.
-Seconds are those of the processor, all its cores together; of settings with a cloud they include the fit.
+Seconds are CPU seconds of all cores together; for settings with a cloud they include the fit.
 """
 
 import argparse

@@ -420,7 +420,7 @@ def test_a_result_with_modelled_effects_is_loaded(tmp_path):
 
 @pytest.mark.parametrize('change', [dict(dVoxel=16.0), dict(offOrigin=(30.0, 0.0, 0.0))])
 def test_a_phantom_on_another_grid_is_its_voxels(change):
-    """Also one with exact projections of its own, which are those of its own grid alone."""
+    """Also a phantom with exact projections, which hold for its own grid alone."""
     sizes = dict(DSO=1000, DSD=1500, nDetector=(40, 48), dDetector=12, nVoxel=32, angles=circular(3))
     phantom = lm.phantom('shepp_logan', size=32)
     scan_geometry = lm.Geometry.cone(**sizes, dVoxel=8.0)

@@ -277,7 +277,7 @@ def test_times_of_views():
 
 @pytest.mark.parametrize('total', [720.0, 1440.0])
 def test_times_of_several_turns(total):
-    """Also where angles do not count the turns, as those of poses."""
+    """Also if angles do not count the turns, like angles of poses."""
     geometry, _ = scanner(10)
     counted = replace(geometry, angles=circular(48, total))
     for scan in (counted, replace(counted, angles=np.mod(counted.angles, 2 * np.pi))):

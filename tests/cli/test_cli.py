@@ -345,7 +345,7 @@ def test_scene_files_are_the_phantoms(monkeypatch, tmp_path, name, files):
 
 
 def test_metal_part_has_a_truth():
-    """The voxels of a mesh scene are its metal: their exact projections match those of the meshes."""
+    """The voxels of a mesh scene are its metal: their exact projections match the projections of the meshes."""
     loaded = load_scene(SCENES / 'metal_part.xml')
     scanner = loaded.scanner
     scanner.geometry = replace(scanner.geometry, nDetector=(48, 48), dDetector=(10, 10), angles=np.array([0.3]))

@@ -45,7 +45,7 @@ class Case:
     """Command that is interrupted.
 
     prepare   makes the folder as it is before
-    task, arguments   as of `Server.run`
+    task, arguments   for `Server.run`
     accept    looks at the folder afterwards
     """
 

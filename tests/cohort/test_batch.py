@@ -49,7 +49,7 @@ def test_a_cohort(home):
         assert row['iterations'] == '20' and row['seed'] == '0' and name in text
         stored_numbers = json.loads((home / 'out' / name / METRICS).read_text())
         assert float(row['psnr_2d']) == stored_numbers['psnr_2d'] and float(row['psnr_3d']) == stored_numbers['psnr_3d']
-    # The numbers are those of `lingo-mi fit`.
+    # `lingo-mi fit` gives the same numbers.
     code, _, err = run(
         FIT, home / 'tiny.xml', '--views', 5, '--iterations', 20, '-D', 'n_points=100', '--out', home / 'fit'
     )

@@ -1,4 +1,4 @@
-"""A cohort on a Dask cluster: a real scheduler with three workers, one of which is killed; and what cannot work."""
+"""A cohort on a Dask cluster: a real scheduler with three workers, of which one is killed, and refused combinations."""
 
 import json
 import os
@@ -22,7 +22,7 @@ NAMES = [f's{i}' for i in range(4)]
 
 @pytest.fixture
 def home(tmp_path):
-    """A folder with a list of four scans, of which each takes seconds and writes a checkpoint several times a second."""
+    """A folder with a list of four scans. Each takes seconds and writes a checkpoint several times a second."""
     (tmp_path / 'tiny.xml').write_text(SCENE)
     rows = [f'{name},tiny.xml,{i + 3},400,200,0.2' for i, name in enumerate(NAMES)]
     header = 'name,geometry,views,iterations,n_points,checkpoint_seconds'
@@ -59,7 +59,7 @@ def require_all_done_once(home):
 
 
 def require_same(home, name, address):
-    """The numbers are those of a fit on such a worker that nothing has interrupted: to the bit, but on a GPU."""
+    """The numbers equal those of an uninterrupted fit on such a worker: to the bit, except on a GPU."""
     record = json.loads((home / 'out' / name / METRICS).read_text())
     rows = (home / 'list.csv').read_text().splitlines()
     (home / 'one.csv').write_text('\n'.join([rows[0], rows[1 + NAMES.index(name)]]))

@@ -1,4 +1,4 @@
-"""Volumes written slab by slab: the same files as of the whole, and volumes that are the same to float32's last digits."""
+"""Volumes written slab by slab: the same files as for the whole volume, and volumes that agree to float32's last digits."""
 
 import subprocess
 import sys

@@ -326,7 +326,7 @@ def test_files_that_are_no_files(tmp_path):
 
 @pytest.mark.parametrize('version', [None, 1, 3, 2.5, '2', True])
 def test_other_versions_are_refused(whole, tmp_path, version):
-    """Those of earlier programs, of which the first had neither version nor checksum, and of later ones."""
+    """Checkpoints of earlier programs, the first without version and checksum, and of later programs."""
     _, content = whole
     extra, path = json.loads(str(content['extra'])), tmp_path / 'checkpoint.npz'
     before = {k: v for k, v in extra.items() if k != 'version'}

@@ -54,7 +54,7 @@ def test_fit(method, data, tmp_path, no_report):
 
 
 def test_the_scene_of_a_result_renders_it(data, tmp_path, no_report):
-    """Also if poses were corrected, of which no two panels are alike."""
+    """Also if poses were corrected, so that no two panels are alike."""
     for name, rates in (('plain', '0,0'), ('poses', '2e-4,2e-5')):
         fit = lm.fit(data, lm.Fast(iterations=40).changed(rate_pose=rates), progress=False)
         fit.save(tmp_path / name)

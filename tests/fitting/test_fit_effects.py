@@ -178,7 +178,8 @@ def test_derivatives_by_differences(name):
 
 
 def test_derivatives_by_the_pose_through_bundles():
-    """Bundles of a focal spot move with their view: the derivative by its source is that of one ray's, for a small spot."""
+    """Bundles of a focal spot move with their view: for a small spot, the derivative by its source is the derivative for one
+    ray."""
     slopes = []
     for size in (0.0, 1e-3):
         stepper, state = stepper_of(Effects(None, FocalSpot((size, size), 2), None), rate_pose=(1e-3, 1e-4))
@@ -305,7 +306,7 @@ def test_resumed_fit_is_the_same_fit(tmp_path, variant):
 
 @physics
 def test_what_a_fit_leaves_behind(tmp_path):
-    """Held-out views are those of result.xml."""
+    """result.xml gives the held-out views."""
     (tmp_path / 'scene.xml').write_text(XML)
     quick = '--iterations', '40', '-D', 'n_points=300', '-D', 'densify_from=100'
     for effects in ('model', 'ignore'):

@@ -87,7 +87,7 @@ def test_ssim_and_its_gradient_match_float64(size, name):
     expected, slope = reference(a, b)
     assert value == pytest.approx(expected, abs=1e-6)
     assert value == pytest.approx(ssim_map(a.astype(float), b.astype(float)).mean(), abs=1e-6)
-    # Where slopes all but vanish, errors are far below those of L1's slope, 1 / a.size.
+    # For slopes near zero, errors are far below the slope of L1, 1 / a.size.
     assert np.abs(gradient - slope).max() <= 1e-4 * np.abs(slope).max() + 2e-7 / a.size
 
 

@@ -1,4 +1,4 @@
-"""`GaussianProjector`: its images are those of `project`, its transpose is one, on arrays of every kind; bad input."""
+"""`GaussianProjector`: its images equal `project`'s, and its transpose is one, on arrays of every kind; bad input."""
 
 import drjit as dr
 import mitsuba as mi

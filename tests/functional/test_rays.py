@@ -78,7 +78,7 @@ def cloud_of(count=9):
 
 @each_scan
 def test_images_of_clouds(scan):
-    """Against differences of the float64 oracle; the values are those of the geometry's own rays."""
+    """Against differences of the float64 oracle; the values equal the values for the geometry's own rays."""
     cloud, arrays = cloud_of()
     weights = np.random.default_rng(0).normal(size=(2, *scan.nDetector))
     vectors, tensors = scan.rays().vectors, [mi.TensorXf(x) for x in arrays]

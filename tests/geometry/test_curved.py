@@ -287,7 +287,7 @@ def smooth(g):
 
 @pytest.mark.parametrize('fine, error', [(1, 3e-2), (2, 2e-3), (4, 1.5e-4)])
 def test_resampling_converges(curved, fine, error):
-    """The error on a flat panel falls with the fourth power of the pixels, as that of cubic splines does."""
+    """The error on a flat panel falls with the fourth power of the pixels, like the error of cubic splines."""
     (rows, columns), step, rays = curved.nDetector, np.array(curved.dDetector) / fine, curved.flat.rays()
     # Three times as high and twice as wide: the body is not cut.
     rays = replace(rays, corner=rays.corner - rows * rays.v - columns / 2 * rays.u, u=rays.u / fine, v=rays.v / fine)

@@ -59,7 +59,7 @@ def browser():
 def opened(browser, address, dark=False, offline=True, ready=True, first=''):
     """A page, its network off, that must leave no error and no warning in the console, and ask for nothing else.
 
-    first   a script that runs before those of the page
+    first   a script that runs before the page's scripts
 
     `page.messages` are the errors and warnings so far, `page.addresses` the addresses of its requests.
     """

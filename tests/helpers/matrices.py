@@ -38,7 +38,7 @@ def device_images(y: np.ndarray):
 
 
 def assert_pair(kind: type, geometry, matrix: np.ndarray, masked: bool) -> None:
-    """Two views of a projector of three, and their transpose, are those of a dense matrix.
+    """Two views of a projector of three, and their transpose, agree with a dense matrix.
 
     masked   with a third of the pixels left out, whatever stands in them
     """

@@ -18,7 +18,7 @@ def in_use(path):
     for number in os.listdir('/proc/self/fd'):
         try:
             names.add(os.readlink(f'/proc/self/fd/{number}'))
-        except FileNotFoundError:  # that of the list itself
+        except FileNotFoundError:  # the descriptor of the list itself
             pass
     return any(name == path or name.startswith(path + os.sep) for name in names)
 

@@ -30,7 +30,7 @@ def test_a_cloud():
 
 
 def test_rays_are_mitsubas_own():
-    """Those that other integrators ask for, also within a crop window, and those of the geometry."""
+    """Other integrators ask for the rays of the geometry, also within a crop window."""
     scene = load(objects(), CURVED)
     sensor = scene.sensors()[0]
     rows, columns = sensor.geometry.nDetector

@@ -170,7 +170,7 @@ def test_batch_of_scanners():
 
 
 def test_batch_of_views():
-    """Of one scanner, with derivatives that are those of its views one by one."""
+    """A batch of one scanner's views; its derivatives equal those of the views one by one."""
     scanner = mi.load_dict(dict(SCANNER, angles='33, 50, 120'))
     batch = dict(type='batch', film=dict(FILM, width=90), **{f'v{i}': scanner.view(i) for i in range(3)})
     scene = load(dict(cloud=ellipsoids(cloud_of())), batch)

@@ -42,7 +42,7 @@ def spiral(geo, pitch):
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 @pytest.mark.parametrize('masked', [False, True])
 def test_a_matrix_and_its_transpose(mode, masked):
-    """`forward` and `adjoint` of any views are those of `grid`, with pixels left out."""
+    """`forward` and `adjoint` of any views agree with `grid`, with pixels left out."""
     geo = laminography(scan(mode, n=3))
     rng, n = np.random.default_rng(0), geo.nDetector
     valid = rng.random((3, *n)) < 0.7 if masked else np.ones((3, *n), bool)

@@ -39,7 +39,7 @@ def cloud(n, seed=0):
 
 
 def image_and_gradients(gaussians, rays, wanted, frozen, weight=None, primal=True, **options):
-    """The image and the derivatives by those of the inputs that are wanted, evaluated."""
+    """The image and the derivatives by the wanted inputs, evaluated."""
     with dr.scoped_set_flag(dr.JitFlag.KernelFreezing, frozen):
         inputs = *(dr.detach(x) for x in gaussians), *(dr.detach(x) for x in (rays.source, rays.corner, rays.u, rays.v))
         leaves = [inputs[i] for i in wanted]

@@ -109,7 +109,7 @@ def test_a_ct_pd_scan_needs_no_flats(tmp_path):
 @pytest.mark.parametrize('crop', [(0, 12, 0, 40), (2, 9, 5, 31)])
 @pytest.mark.parametrize('binning', [1, 2])
 def test_part_of_a_curved_panel(tmp_path, crop, binning):
-    """Rays of a crop are those of its pixels; a bin's is in the middle of its pixels' corners."""
+    """A crop has the rays of its pixels; a bin's ray is in the middle of its pixels' corners."""
     scanner = CTPD(views=2, turns=0.1)
     scanner.write(tmp_path / 'scan', scanner.projections(SPHERES))
     v0, v1, u0, u1 = crop

@@ -391,7 +391,7 @@ def test_rows_of_rtk_run_up(tmp_path, named):
     scan = load(tmp_path / 'frames.npy', source, **options)
     np.testing.assert_allclose(scan.projections, p, atol=1e-5)
     np.testing.assert_allclose(scan.geometry.rays().corner, geometry.rays().corner, atol=1e-9)
-    # Frame rows 1 to 8 are our rows 3 to 10, of which binning by 3 keeps the first six.
+    # Frame rows 1 to 8 are our rows 3 to 10; binning by 3 keeps the first six of them.
     part = load(tmp_path / 'frames.npy', source, **options, crop=(1, 8, 2, 12), binning=3)
     mean = np.exp(-p[:, 3:9, 2:11]).reshape(3, 2, 3, 3, 3).mean((2, 4))
     np.testing.assert_allclose(part.projections, -np.log(mean), atol=1e-5)

@@ -42,7 +42,8 @@ def test_filled_pixels(scan, kind, share):
 
 
 def test_one_dead_pixel_does_not_stop_fdk(scan):
-    """The volume is within two hundredths of that of all pixels where the dead one is seen, and the slabs are the volume."""
+    """In the rays of the dead pixel, the volume is within two hundredths of the volume of all pixels; the slabs equal the
+    volume."""
     valid = np.ones(scan.projections.shape, bool)
     valid[:, 50, 45] = False
     holed = replace(scan, valid=valid)

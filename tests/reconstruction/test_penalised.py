@@ -68,7 +68,7 @@ def test_the_minimum_does_not_depend_on_the_start(scan):
 
 @pytest.mark.thorough
 def test_the_strength_is_chosen(scan):
-    """Near the best one of the path, of which the truth knows."""
+    """Near the best one of the path, which the truth shows."""
     scan, truth = scan
 
     def quality(strength):

@@ -10,7 +10,7 @@ from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.reconstruction.memory_needs import NEEDS, memory_needed
 
-# Not `resource`, whose maximum begins with that of the process which started this one.
+# Not `resource`, whose maximum begins with the maximum of the parent process.
 pytestmark = pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='asks Linux for its peak memory')
 
 PROGRAM = """

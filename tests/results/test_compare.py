@@ -110,7 +110,7 @@ def test_numbers_and_what_differs(pair):
 
 
 def test_in_a_browser(pair, tmp_path):
-    """The values at the crosshair are those of the files, and differences those to the truth."""
+    """The values at the crosshair come from the files, and differences are to the truth."""
     truth = np.random.default_rng(9).random(SHAPE).astype(np.float32)
     write_volume(tmp_path / 't.nii.gz', truth, Grid(SHAPE, 2.0), 'density per mm')
     code, out, err = run(COMPARE, *pair, '--truth', tmp_path / 't.nii.gz', '--out', tmp_path / 'c.html', variant=False)
@@ -166,7 +166,7 @@ def test_other_places(pair, tmp_path):
     write_volume(
         tmp_path / 'x.nii.gz', np.ones(SHAPE, np.float32), Grid(SHAPE, 2.0, (50.0, 0.0, 0.0)), 'density per mm'
     )
-    with pytest.raises(InputError, match='x: its voxels lie elsewhere than those of a'):
+    with pytest.raises(InputError, match='x: its voxels lie elsewhere than the voxels of a'):
         compare_page([load_result(pair[0]), load_result(tmp_path / 'x.nii.gz')])
 
 

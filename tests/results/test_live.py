@@ -349,7 +349,7 @@ def test_a_fit_that_does_not_answer(chromium, data):
 
 @pytest.mark.thorough
 def test_the_page_follows_a_real_fit(chromium, data, monkeypatch):
-    """Its last values are those of the volume that the fit gives. Once it has something to show, the fit waits for the page."""
+    """Its last values come from the fit's volume. Once it has something to show, the fit waits for the page."""
     pages, go_on, results = queue.Queue(), threading.Event(), []
     monkeypatch.setattr(Live, 'announce', lambda page: pages.put(page))
     step = Live.step

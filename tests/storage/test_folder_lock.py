@@ -54,7 +54,7 @@ def test_folders_are_removed_again(tmp_path):
 
 @pytest.mark.parametrize('system', [None, pytest.param('refuses', marks=pytest.mark.posix)])
 def test_without_locks_of_the_system(tmp_path, monkeypatch, system):
-    """The file itself is the lock, and that of a dead process of this computer is taken over."""
+    """The file itself is the lock, and a dead process's lock on this computer is taken over."""
 
     def flock(*_):
         raise OSError(95, 'not supported')

@@ -1,4 +1,4 @@
-"""Voxels as boxes: their projections are those of boxes."""
+"""Voxels as boxes: their projections are projections of boxes."""
 
 import numpy as np
 import pytest

@@ -46,7 +46,7 @@ CASES = all_cases()
 
 @pytest.fixture(scope='module', autouse=True)
 def two_threads(variant):
-    """Sums of many Gaussians are split among the threads, so their errors are those of two threads or more."""
+    """Sums of many Gaussians are split among the threads, so their errors hold for two threads or more."""
     before = dr.thread_count()
     use_threads(max(2, before))
     yield

@@ -350,7 +350,7 @@ def test_presets_are_described_as_measured(variant):
 
 @pytest.mark.thorough
 def test_presets_of_two_variants(tmp_path, monkeypatch):
-    """The presets alone, by the command: their table with another run's errors, in place of that of the document."""
+    """The presets alone, by the command: their table with another run's errors replaces the document's table."""
     actual = measure_presets(TINY)
     other = json.loads(json.dumps(actual))
     other['conditions']['variant'] = 'cuda_ad_mono'

@@ -1,4 +1,4 @@
-"""The cells of docs/tables are those of today's code, so that a table goes on from them."""
+"""The cells of docs/tables belong to today's code, so that a table goes on from them."""
 
 import json
 from dataclasses import replace

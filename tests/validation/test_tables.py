@@ -99,7 +99,7 @@ def test_two_stages(out):
     assert rows['voxelize']['none'] is None and '| voxelize | foot | – | – |' in text
     volumes = [rows[a][m]['psnr_3d_r2'] for a in ('fdk', 'sart', 'asd-pocs') for m in ('none', 'r2')]
     assert len(set(volumes)) == 6 and min(volumes) > 0
-    # The numbers are those of the algorithms, on views rendered from the stored cloud.
+    # The algorithms give the same numbers on views rendered from the stored cloud.
     cells = Cells(out, TINY)
     fit = Fit('foot', 4, 'r2', 20)
     whole = cells._completed(fit)
@@ -345,7 +345,7 @@ def theirs(tmp_path_factory):
 
 
 def test_scans_of_a_folder(theirs, tmp_path):
-    """The numbers are those of fits to the files, beside what is published of a scene of that name."""
+    """Fits to the files give the same numbers, beside the published ones of a scene of that name."""
     assert list(scans_in(theirs)) == ['cone_foot', 'foot']
     options = '--views', '4', '--iterations', '20', '--methods', 'r2:n_points=200', 'xgaussian', '--out', tmp_path
     code, text, err = run('x3d', theirs, '--tables', 'scenes', *options)

@@ -1,4 +1,4 @@
-"""The cells of the paper's tables on three workers, one of which is killed: the same numbers as of workers that nothing stops."""
+"""The cells of the paper's tables on three workers, of which one is killed: the same numbers as from undisturbed workers."""
 
 import json
 import os

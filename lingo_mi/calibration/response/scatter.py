@@ -48,7 +48,7 @@ class ScatterImage(ResponsePart):
 
     def doubt(self, errors):
         image = self._image(self.values[0], EVERYWHERE)
-        error = np.sqrt(self._image(errors[0] ** 2, EVERYWHERE, 2))  # as of independent numbers
+        error = np.sqrt(self._image(errors[0] ** 2, EVERYWHERE, 2))  # as if the numbers were independent
         return 'it would be negative in places' if (image < -SURE * error).any() else ''
 
     def _image(self, c, place, power=1):

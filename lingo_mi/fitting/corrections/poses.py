@@ -84,7 +84,7 @@ class Poses:
         return Geometry.from_poses(rays, g.nDetector, grid=g.grid)
 
     def between(self, scan: Geometry, geometry: Geometry) -> Geometry:
-        """A geometry with smooth corrections for the time of its views, which were taken among those of the scan.
+        """A geometry with smooth corrections for the time of its views, which were taken during the scan.
 
         It is returned unchanged if each view has its own correction: these say nothing about other views.
         """

@@ -23,7 +23,7 @@ class ResponseCorrection(Correction):
     """
 
     def __init__(self, response: Response, scan: Scan, effects: str, weights: str):
-        """response: of the model; effects and weights: as of the method and its loss."""
+        """response: the response of the model; effects and weights: the options of the method and its loss."""
         self.response, self.measured, self.weights = response, trusted(scan, effects), weights
 
     def before_step(self, fit: CorrectedFit, state: DeviceState, iteration: int) -> None:

@@ -1,7 +1,7 @@
 """The neural attenuation field: a multiresolution hash grid and a small network, by Dr.Jit's `drjit.nn`.
 
-Zha, Zhang and Li, "NAF: Neural Attenuation Fields for Sparse-View CBCT Reconstruction", MICCAI 2022; the encoding is that of
-Müller et al., "Instant Neural Graphics Primitives with a Multiresolution Hash Encoding", ACM TOG 41 (2022).
+Zha, Zhang and Li, "NAF: Neural Attenuation Fields for Sparse-View CBCT Reconstruction", MICCAI 2022; the encoding is by Müller
+et al., "Instant Neural Graphics Primitives with a Multiresolution Hash Encoding", ACM TOG 41 (2022).
 """
 
 from __future__ import annotations

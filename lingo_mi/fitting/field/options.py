@@ -26,7 +26,7 @@ class Field(Part):
     field_base : int
         Grid points along a side of the coarsest level (NAF: 16).
     field_growth : float
-        Grid points of a level over those of the level below (NAF: 2).
+        Ratio of the grid points of two successive levels (NAF: 2).
     field_cube : float
         Side of the cube that the grid covers, in units of the volume's longest side (NAF: 0.6 m, for volumes of 256 mm).
     field_layers : int

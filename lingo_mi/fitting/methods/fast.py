@@ -21,8 +21,8 @@ class Fast(DensityMethod):
     As in `LINGO`, Otsu masks of all views decide where Gaussians start, and the dynamic scale multiplies the loss. The fit
     differs from the published one in these points:
 
-    - Within the masks, Gaussians start on the edges of a quick reconstruction, and their densities are those of its voxels.
-    - The loss has the gradient of the difference beside L1, which restores fine detail sooner, and more weight on SSIM.
+    - Within the masks, Gaussians start on the edges of a quick reconstruction, and their densities are the densities of its
+    voxels. - The loss has the gradient of the difference beside L1, which restores fine detail sooner, and more weight on SSIM.
     - Rates are 3 to 40 times higher and fall over the run. The second moment has a shorter memory, the first one is Nesterov's,
       and the result is the mean of the last steps.
     - Views in a row lie well apart.
@@ -32,7 +32,7 @@ class Fast(DensityMethod):
       multiplies the gradients, and the threshold makes up for it.
     - The fit stops early if the scan says how many photons a pixel counts.
 
-    The options are those of `DensityMethod`.
+    It has the options of `DensityMethod`.
 
     Examples
     --------

@@ -15,7 +15,7 @@ from lingo_mi.fitting.start.start import Start
 class LINGO(DensityMethod):
     """LINGO, the published method: Otsu masks of all views for a start, and R2-Gaussian's fit with a dynamic loss scale.
 
-    The options are those of `DensityMethod`. The paper takes the mean pixel as the density of a Gaussian;
+    It has the options of `DensityMethod`. The paper takes the mean pixel as the density of a Gaussian;
     `density` of `MaskStart` lists other factors.
 
     References

@@ -12,7 +12,7 @@ from lingo_mi.fitting.methods.densities import DensityMethod
 class R2(DensityMethod):
     """R2-Gaussian with its published settings: voxels of an FDK volume for a start, 30,000 steps.
 
-    The options are those of `DensityMethod`.
+    It has the options of `DensityMethod`.
 
     References
     ----------

@@ -64,8 +64,7 @@ class AlphaCompositing(ForwardModel):
         return scale.max(1) <= largest
 
     def gaussians(self, values: dict) -> tuple:
-        """Return the Gaussians as in `ForwardModel`; the further arguments are the arguments of
-        `projectors.radiance.radiance_towards`."""
+        """Return the Gaussians as in `ForwardModel`, and then the arguments of `projectors.radiance.radiance_towards`."""
         radiance = [values[k] for k in ('radiance', 'harmonics') if k in values]
         return *self._shape(values), 1 / (1 + dr.exp(-values['opacity'])), *radiance
 

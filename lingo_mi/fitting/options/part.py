@@ -132,7 +132,7 @@ def family(kind: type[Part]) -> type[Part]:
 
 
 def kinds_of(kind: type[Part]) -> dict[str, type]:
-    """All kinds of a part by name, those of other packages included."""
+    """All kinds of a part by name, including kinds from other packages."""
 
     def below(cls: type) -> Iterator[type]:
         for sub in cls.__subclasses__():

@@ -1,9 +1,9 @@
 """Errors, times and memory of methods that compute the same image.
 
 Errors are relative to `closed_form`, in float64: |found - expected| / |expected| in the L2 norm, and the largest
-deviation over the largest expected value. Derivatives are those of sum(weights * image) with fixed normal weights: their
-sums cancel, as for a real residual. Times are medians over rounds in which the methods of a table take turns, so that
-all run under the same conditions.
+deviation over the largest expected value. Derivatives are taken of sum(weights * image) with fixed normal weights: their sums
+cancel, as for a real residual. Times are medians over rounds in which the methods of a table take turns, so that all run under
+the same conditions.
 """
 
 from __future__ import annotations

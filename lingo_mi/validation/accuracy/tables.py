@@ -33,7 +33,7 @@ SHOWN = 'conditions', 'presets'  # what the page of the documentation shows; it 
 
 
 def make_tables(results: dict, beside: dict | None = None) -> dict[str, str]:
-    """Markdown tables by name, those of TITLES; of presets alone, their own.
+    """Markdown tables by the names of TITLES; presets alone have their own table.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def preset_table(results: dict, beside: dict | None = None) -> str:
         title = beside['conditions']['variant'].split('_')[0].upper()
         for row, other in zip(rows, preset_rows(beside['cutoff'])):
             row.update(other_image=other['image'], other_worst=max(other[key] for key in NAMES))
-        # Before the times, which are those of the first variant alone.
+        # Before the times, which belong to the first variant alone.
         columns[-2:-2] = [(f'image, L2, {title}', _error('other_image')), (f'worst ∂, {title}', _error('other_worst'))]
     return table(columns, rows)
 

@@ -232,7 +232,7 @@ class Cells:
         return numbers if numbers and numbers.keys() >= set(needed) else None
 
     def record_all(self, cells: Iterable[Fit | Volume]) -> None:
-        """Add those of the cells that are stored to the record."""
+        """Add the stored ones of the cells to the record."""
         if self.record is not None:
             self.record.add({self._key(cell): numbers for cell in cells if (numbers := self.get(cell)) is not None})
 
@@ -271,7 +271,7 @@ class Cells:
         return numbers
 
     def compute_missing(self, planned: list[Fit | Volume], after_each: Callable[[], object]) -> dict:
-        """Compute those of the planned cells that are not stored, one by one; the errors of those that failed, by cell.
+        """Compute the planned cells that are not stored, one by one, and return the errors of failed ones by cell.
 
         Raises KeyboardInterrupt, which says that the same command goes on.
         """

@@ -18,7 +18,7 @@ from lingo_mi.validation.tables.record import Record
 def compute_missing(
     cells: Cells, planned: Sequence[Fit | Volume], runner: Runner, after_each: Callable[[], object]
 ) -> dict[Fit | Volume, str]:
-    """Compute those of the planned cells that are not stored, side by side; the one line of those that failed, by cell.
+    """Compute the planned cells that are not stored, side by side, and return the one-line errors of failed ones by cell.
 
     A series is one job: the fits of an object, a number of views and a method, shorter ones first because longer ones go on from
     them, and the volumes made of these fits. Raises KeyboardInterrupt, which says that the same command goes on.

@@ -163,7 +163,7 @@ def test_parameters_survive_result_xml(tmp_path):
 
 @pytest.fixture(scope='module')
 def scans():
-    """Of a ball of water of 200 mm: without scatter, and with it by other random numbers than those of the fits."""
+    """Scans of a ball of water of 200 mm: without scatter, and with scatter by other random numbers than in the fits."""
     g = geometry(12, nDetector=(24, 24), dDetector=(16.0, 16.0), nVoxel=(16, 16, 16), dVoxel=(16.0, 16.0, 16.0))
     x = (np.arange(16) - 7.5) * 16
     r = np.sqrt(x[:, None, None] ** 2 + x[:, None] ** 2 + x**2)

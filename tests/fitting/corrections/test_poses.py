@@ -121,7 +121,7 @@ def test_checkpoints_keep_the_poses(tmp_path, sums_in_order):
 
 
 def test_poses_left_alone_compile_nothing_new(monkeypatch):
-    """A fit without corrections is that of a loop that has never heard of them; a second view compiles nothing."""
+    """A fit without corrections runs as if there were none; a second view compiles nothing."""
     scan = tiny_scan(geometry(3))
 
     def kernels(method):

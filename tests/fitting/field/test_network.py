@@ -36,7 +36,7 @@ def test_density_is_that_of_a_reference_in_float64(method, points):
 
 
 def test_published_size():
-    """16 levels, of which the three coarsest are stored whole, 2 features, and a network of 4225 numbers."""
+    """16 levels with 2 features, the three coarsest stored whole, and a network of 4225 numbers."""
     shapes = Network(NAF().field).shapes
     assert shapes == {'features': (2 * (16**3 + 32**3 + 64**3 + 13 * 2**19), 1), 'network': (4225, 1)}
 

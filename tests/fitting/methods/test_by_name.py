@@ -1,4 +1,4 @@
-"""The methods by name: those of this package, and an outsider's."""
+"""The methods by name: this package's, and an outsider's."""
 
 import json
 from dataclasses import dataclass

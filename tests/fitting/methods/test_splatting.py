@@ -56,7 +56,7 @@ def whole(request, scan):
 
 
 def towards(directions, mode='cone'):
-    """A view, and Gaussians to which its rays run along the directions [N, 3]; those of a parallel beam along the first."""
+    """A view, and Gaussians to which its rays run along the directions [N, 3]; rays of a parallel beam run along the first."""
     view = View.of(geometry(mode=mode).normalised_rays(), 0, 8, 8)
     if mode == 'parallel':
         view.source = vector64(directions[0])
@@ -341,7 +341,7 @@ def test_what_a_fit_leaves(result):
 
 
 def test_mitsuba_reads_the_cloud_as_3dgs(result, scene):
-    """Its `ellipsoids` shape knows 3DGS's columns; the values are those of the checkpoint."""
+    """Its `ellipsoids` shape knows 3DGS's columns; the checkpoint has the same values."""
     folder, _ = result
     params = mi.traverse(mi.load_dict(dict(type='ellipsoids', filename=str(folder / 'gaussians.ply'))))
     with np.load(folder / 'checkpoint.npz') as stored:

@@ -1,4 +1,4 @@
-"""Fitted Gaussians with densities, in other geometries than that of their scan."""
+"""Fitted Gaussians with densities, in other geometries than their scan's."""
 
 from dataclasses import replace
 from unittest import mock

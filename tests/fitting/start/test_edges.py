@@ -97,7 +97,7 @@ def test_nothing_to_see(ball):
 
 
 def with_speck(ball):
-    """A scan with a bright pixel in one view: SART smears it along its ray, of which the other views know nothing."""
+    """A scan with a bright pixel in one view: SART smears it along its ray, which the other views do not show."""
     projections = ball.projections.copy()
     projections[3, 4, 5] = 0.6 * projections.max()
     return replace(ball, projections=projections)
