@@ -3,7 +3,7 @@ Few views: completion and refinement
 ====================================
 
 Ten views say little about most voxels. A fitted cloud says what is likely there: iterative algorithms start from its volume,
-and `Refined` mends it where it is wrong.
+and `Refined` corrects its errors.
 """
 
 # %%

@@ -49,8 +49,8 @@ for _ in range(120):
 print(f'mean squared error {losses[0]:.1f} -> {losses[-1]:.2f}')
 
 # %%
-# The volume, by `lm.voxelize`, which is differentiable, too. It is soft: `lm.fit` adds Gaussians where they lack, and starts
-# from a better place.
+# The volume, by `lm.voxelize`, which is differentiable, too. It is soft: `lm.fit` adds Gaussians where they are missing, and
+# starts from a better place.
 
 with torch.no_grad():
     volume = lm.voxelize(means, scales.exp(), quaternions, torch.nn.functional.softplus(density), geometry)

@@ -17,7 +17,7 @@ from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.geometry import CurvedGeometry, Geometry, Grid
 from lingo_mi.geometry.rays import Index, checked_views
 
-PIECE = 16  # views that are read together where all are gone through
+PIECE = 16  # views that are read together in a pass over all views
 
 
 class PixelEffects(Protocol):

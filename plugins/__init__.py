@@ -27,7 +27,7 @@ PLUGINS = {
 
 
 def register() -> None:
-    """Register all plugins with the active variant: where it has no derivatives, what says which variants have."""
+    """Register all plugins with the active variant: if it has no derivatives, a stub says which variants have."""
     works = 'ad' in (mi.variant() or '').split('_')
     for name, (module, registrar) in PLUGINS.items():
         if not works:

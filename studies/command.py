@@ -27,7 +27,7 @@ def updated_table(file: Path, table: Callable[[], str]) -> Iterator[Callable[[st
     the end the table is printed. After KeyboardInterrupt the same command goes on.
     """
 
-    def renew(line: str) -> None:
+    def update(line: str) -> None:
         print(line, flush=True)
         write()
 
@@ -37,7 +37,7 @@ def updated_table(file: Path, table: Callable[[], str]) -> Iterator[Callable[[st
 
     with locked(file.parent):
         try:
-            yield renew
+            yield update
         except KeyboardInterrupt:
             raise KeyboardInterrupt('the same command goes on from here') from None
         write()

@@ -30,7 +30,7 @@ from studies.command import run_study
 
 VARIANT = 'cuda_ad_mono'
 REHEARSAL = 900  # seconds for each part under the stand-in
-TESTS = (  # those that were mended since they last ran on a GPU, and the operator's
+TESTS = (  # tests repaired since they last ran on a GPU, and the operator's
     'tests/common/test_memory.py',
     'tests/fitting/test_fit.py',
     'tests/functional/test_functional.py',

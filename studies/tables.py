@@ -17,7 +17,7 @@ more for the ablation; half an hour (aneurism) to two hours (chest) an object. S
 and 30,000 iterations, and of the objects also chest_lidc0314 and head_fsrt; it is meant for a GPU.
 
 Each fit and each reconstruction is stored as soon as it is done. After any interruption the same command goes on, and other
-tables use what is there. The table, as Markdown and JSON, is renewed after every one of them, with TABLE.provenance.json beside
+tables use what is there. The table, as Markdown and JSON, is updated after every one of them, with TABLE.provenance.json beside
 it, which says how. --record keeps the numbers of all cells in one file, from which a table can be continued on another machine
 without the checkpoints. With --cluster, cells are computed side by side on the workers of a Dask cluster.
 """

@@ -58,7 +58,7 @@ def test_neither_tests_nor_scripts_nor_studies_are_installed(built):
 
 
 def test_import_from_the_folder_that_holds_the_clone(tmp_path):
-    """The clone's folder, which has the package's name, is no package: Python must go on to the path of the installation."""
+    """The clone's folder has the package's name but is not a package: Python must go on to the path of the installation."""
     (tmp_path / 'lingo_mi').symlink_to(ROOT)
     code = 'import lingo_mi, lingo_mi.plugins, lingo_mi.scenes; print(lingo_mi.__version__)'
     environment = os.environ | {'PYTHONPATH': str(ROOT)}

@@ -85,7 +85,7 @@ def test_files_keep_the_mask(tmp_path, scan):
     for kind in ('naf', 'r2', 'exr'):
         with pytest.raises(InputError, match='no mask of valid pixels'):
             write_scan(tmp_path / 'b', masked, kind)
-    # One mask for all views; dead pixels of intensities have no logarithm, and NaN is no obstacle where it is masked.
+    # One mask for all views; dead pixels of intensities have no logarithm, and masked NaN does no harm.
     values = yaml.safe_load((tmp_path / 'a.yml').read_text()) | {'input': 'intensity', 'I0': 1e4, 'valid': 'dead.npy'}
     counts = 1e4 * np.exp(-scan.projections / scan.projections.max())
     counts[:, 3, 4], counts[:, 5, 6] = 0, np.nan

@@ -16,7 +16,7 @@ NEAR = 1e-6  # radians that are none
 def scan_times(geometry: Geometry, angles: np.ndarray) -> np.ndarray:
     """The time of views at `angles` [m] radians, -1 for a scan's first view and 1 for its last: their place between its angles.
 
-    The views of the scan are in the order of their time, at even intervals. Where its angles turn back, or there is one view
+    The views of the scan are in the order of their time, at even intervals. If its angles turn back, or there is one view
     only, angles do not tell the time, and views are taken in their own order.
     """
     n = len(geometry)

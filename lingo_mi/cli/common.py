@@ -351,21 +351,21 @@ def runner_of(args: argparse.Namespace, folder: Path) -> Iterator[Any]:
 
 
 def docs_arguments(parser: argparse.ArgumentParser, document: str, figures: str) -> None:
-    """Add the arguments that say which documentation to renew: --docs, --document, --figures; see `docs_of`.
+    """Add the arguments that say which documentation to update: --docs, --document, --figures; see `docs_of`.
 
     Parameters
     ----------
     document, figures : str
-        Where in the folder --docs the Markdown page and the folder of the pictures are, unless named.
+        Places of the Markdown page and of the folder of pictures in the folder --docs, unless named.
     """
     parser.add_argument(
-        '--docs', type=Path, metavar='DIR', help='renew the documentation in DIR (default: nothing outside --out)'
+        '--docs', type=Path, metavar='DIR', help='update the documentation in DIR (default: nothing outside --out)'
     )
     parser.add_argument(
         '--document',
         type=Path,
         metavar='FILE',
-        help=f'Markdown page whose tables to renew, between <!-- table NAME --> and <!-- end NAME --> '
+        help=f'Markdown page whose tables to update, between <!-- table NAME --> and <!-- end NAME --> '
         f'(default: {document} in --docs)',
     )
     parser.add_argument(
@@ -375,7 +375,7 @@ def docs_arguments(parser: argparse.ArgumentParser, document: str, figures: str)
 
 
 def docs_of(args: argparse.Namespace) -> tuple[Path | None, Path]:
-    """The page to renew, if any, and the folder of the pictures, of the arguments that `docs_arguments` added.
+    """The page to update, if any, and the folder of the pictures, of the arguments that `docs_arguments` added.
 
     Raises
     ------

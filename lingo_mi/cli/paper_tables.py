@@ -152,17 +152,17 @@ def _make(
             leftover.unlink(missing_ok=True)
     planned = plan(rows, objects)
 
-    def renew():
+    def update():
         write(table, rows, objects, every, name)
 
     failed: list[tuple[Any, Any]] = []
     for cells in every:
         if args.cluster is None:
-            failed += cells.compute_missing(planned, renew).items()
+            failed += cells.compute_missing(planned, update).items()
         else:
             folder.mkdir(parents=True, exist_ok=True)
             with runner_of(args, folder) as runner:
-                failed += compute_missing(cells, planned, runner, renew).items()
+                failed += compute_missing(cells, planned, runner, update).items()
     print(write(table, rows, objects, every, name))
     print(f'{folder}/: {table}.md, {table}.json, {table}.provenance.json')
     return [(cell, error, len(planned) * len(every)) for cell, error in failed]

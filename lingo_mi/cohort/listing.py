@@ -94,7 +94,7 @@ def _records(path: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     try:
         records = [(reader.line_num, cells) for cells in reader if any(map(str.strip, cells))]
     except csv.Error as error:
-        raise InputError(f'{path}, line {reader.line_num}: is not CSV ({error}); mend its quotes') from None
+        raise InputError(f'{path}, line {reader.line_num}: is not CSV ({error}); correct its quotes') from None
     if not records:
         raise InputError(f'{path}: is empty; its first line must name the columns, such as file,geometry,views')
     header = [name.strip() for name in records[0][1]]

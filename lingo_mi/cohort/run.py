@@ -1,4 +1,4 @@
-"""Runs a cohort: what is missing of it, with the table and the log renewed after every scan."""
+"""Runs a cohort: what is missing of it, with the table and the log updated after every scan."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def run_cohort(rows: Sequence[Row], out: Path, runner: Runner, done: dict[str, d
     table, log, numbers = Table(out, rows), Log(out), dict(done)
     for name, metrics in done.items():
         table.done(name, metrics)
-    table.renew()  # a log without a table would be a stranger's
+    table.update()  # a log without a table would be a stranger's
     log.add(f'batch of {len(rows)} scans, {len(done)} of them done')
 
     def tell(event: Event) -> None:
@@ -69,7 +69,7 @@ def run_cohort(rows: Sequence[Row], out: Path, runner: Runner, done: dict[str, d
             table.state(event.name, 'failed', event.value)
         else:
             table.state(event.name, 'running')
-        table.renew(force=False)
+        table.update(force=False)
 
     missing = [row for row in rows if row.name not in done]
     jobs = [Job(row.name, row.fit_method().iterations, fit_row, (row, str(out.resolve()))) for row in missing]
@@ -78,6 +78,6 @@ def run_cohort(rows: Sequence[Row], out: Path, runner: Runner, done: dict[str, d
     except KeyboardInterrupt:
         log.add('interrupted')
         table.interrupted()
-        table.renew()
+        table.update()
         raise KeyboardInterrupt('the same command goes on from here') from None
     return Outcome(numbers, failed, table.finish())

@@ -15,7 +15,7 @@ from lingo_mi.storage.file_access import reading, replacing, write_text
 
 CSV, PARQUET, LOG = 'results.csv', 'results.parquet', 'batch.log'
 FIRST = 'name', 'status', 'error', 'file', 'geometry', 'method', 'views', 'seed'
-PAUSE = 5.0  # seconds between two renewals while jobs run
+PAUSE = 5.0  # seconds between two updates while jobs run
 
 
 class Table:
@@ -53,7 +53,7 @@ class Table:
             if row['status'] == 'running':
                 row['status'] = 'interrupted'
 
-    def renew(self, force: bool = True) -> None:
+    def update(self, force: bool = True) -> None:
         """Write results.csv; without `force` not more often than every few seconds."""
         if not force and time.monotonic() - self._written < PAUSE:
             return
@@ -66,7 +66,7 @@ class Table:
 
     def finish(self) -> list[Path]:
         """Write the table in every form; returns the files."""
-        self.renew()
+        self.update()
         try:
             arrow, parquet = map(importlib.import_module, ('pyarrow', 'pyarrow.parquet'))
         except ImportError:

@@ -1,4 +1,4 @@
-"""The one exception for input that a user can mend, and the one warning of numbers that are not as good as promised."""
+"""The one exception for input that a user can correct, and the one warning of numbers that are less accurate than promised."""
 
 LONGEST = 299  # characters of a message that a command prints
 
@@ -12,7 +12,7 @@ def printable(text: object) -> str:
 def brief(text: object, longest: int = LONGEST) -> str:
     """A `printable` text, its middle left out if it is longer than `longest`.
 
-    What it names stays at the start and how to mend it at the end, even if a file's text stands between.
+    The name stays at the start and the remedy at the end, even if a file's text stands between them.
     """
     text = str(text)
     if len(text) > 4 * longest:  # before every character is examined
@@ -34,7 +34,7 @@ def shown(value: object) -> str:
 
 
 class InputError(ValueError):
-    """Input that cannot be used. The message is one line: what is wrong, where, and how to mend it.
+    """Input that cannot be used. The message is one line: what is wrong, where, and how to correct it.
 
     It names Python's arguments, as in `force=True`. Commands print it in less than 300 characters, with their options instead
     (see `lingo_mi.cli.common.guard`), and exit with code 2.

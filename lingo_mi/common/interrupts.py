@@ -13,7 +13,7 @@ from contextlib import contextmanager
 def between_steps() -> Iterator[Callable[[], None]]:
     """Hold Ctrl-C back: yields a function that raises KeyboardInterrupt if it was pressed since the last call.
 
-    A loop that calls it between its steps is never stopped within one, where its state is half old and half new. A
+    A loop that calls it between its steps is never stopped within a step, when its state is half old and half new. A
     second Ctrl-C stops at once.
     """
     if threading.current_thread() is not threading.main_thread():  # Python delivers signals to the main thread only

@@ -16,7 +16,7 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.files.voxels import MOST_DEFLATED, require_claim, require_end
 from lingo_mi.storage.file_access import one_line, quiet, reading
 
-_TO_MM = {'meter': 1000.0, 'micron': 1e-3}  # mm, and where no unit is told
+_TO_MM = {'meter': 1000.0, 'micron': 1e-3}  # mm, also if the file gives no unit
 _LONGEST_HEADER = 540
 
 

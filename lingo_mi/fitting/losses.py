@@ -43,7 +43,7 @@ def combined(
     """lambda_l1 L1 + lambda_ssim (1 - SSIM) + lambda_gradient `gradient_error` of an image and its truth, both Float
     [height * width], row by row.
 
-    L1 is the mean absolute error, its subgradient 0 where the two agree. SSIM is by Wang et al. (IEEE TIP 2004) in the form
+    L1 is the mean absolute error, its subgradient is 0 where the two agree. SSIM is by Wang et al. (IEEE TIP 2004) in the form
     of 3D Gaussian Splatting: a Gaussian window of 11 x 11 pixels, sigma 1.5, zeros around the images, full scale 1,
     C1 = 0.01^2, C2 = 0.03^2, biased variances. Differentiable in the image, in reverse mode; the truth is a constant. Raises
     InputError if an image has another number of pixels.

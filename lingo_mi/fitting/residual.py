@@ -17,7 +17,7 @@ def residual_numbers(rendered: np.ndarray, test: Scan) -> dict:
     -------
     dict
         `residual_rms`; `residual_by_view`, the same of each view (None without a valid pixel); and `residual_to_noise`, the rms
-        of the residual over the noise of its pixel, which 1 would be noise alone, where the views have noise. The variance of
+        of the residual over the noise of its pixel, which 1 would be noise alone, if the views have noise. The variance of
         the noise is exp(p) / photons, with p as rendered, and photons estimated by `photons_of_images`.
     """
     photons = photons_of_images(test.projections, test.valid)

@@ -91,7 +91,7 @@ class Rays:
     def by_motion(self, by_vectors: ArrayLike) -> np.ndarray:
         """Derivatives by a rigid motion of each view, [n, 6], of a number whose derivatives by `vectors` are [n, 4, 3].
 
-        The first three are by a turn about the origin, a rotation vector in radians; the others by a shift. Where all views
+        The first three are by a turn about the origin, a rotation vector in radians; the others by a shift. If all views
         move together, sum over them.
 
         Examples

@@ -46,7 +46,7 @@ def voxelize_triangles(
     low [3], step [3]   corner of the grid and voxel size, the unit of the triangles
 
     Columns along z are cut by the mesh, 4 x 4 a voxel; between two crossings a voxel is covered by the length it shares
-    with the column, once for each part of the mesh that it lies in: where parts overlap, shares add up to more than 1. Which way
+    with the column, once for each part of the mesh that it lies in: if parts overlap, shares add up to more than 1. Which way
     round the mesh is as a whole plays no part.
     """
     low, step, fine = np.asarray(low, float), np.asarray(step, float), 4

@@ -208,7 +208,7 @@ def _end(name: str, future: Any) -> Event:
 
 @contextmanager
 def _local(distributed: Any, count: int) -> Iterator[str]:
-    """A scheduler and worker processes of this machine, each with one thread for tasks and, where there are any, one GPU."""
+    """A scheduler and worker processes of this machine, each with one thread for tasks and, if the machine has GPUs, one GPU."""
     gpus = visible_gpus()
 
     def options(i):

@@ -199,7 +199,7 @@ def project(gaussians: Sequence, view: View, extent: float, widen: float = 0.0, 
     e12 = e12 - shear * e11
     e2 = e2 - shear * e1
     if widen and not view.parallel:
-        # Where |d|^2 is not nearly constant over the widened footprint, num <= kappa^2 den may be no ellipse.
+        # If |d|^2 is not nearly constant over the widened footprint, num <= kappa^2 den may not be an ellipse.
         with dr.suspend_grad():
             bent = extent * extent * dr.maximum(e11 / dr.square(mx), e22 / dr.square(my)) > 0.5
             straddles |= visible & bent

@@ -43,7 +43,7 @@ NEAR = 1e-9  # a mesh touches the source if its nearest vertex has at most this 
 class MeshPaths:
     """A closed mesh, ready to be projected.
 
-    Where parts overlap, lengths add up.
+    If parts overlap, their lengths add up.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ def _closed(vertices, faces, name):
     if faces.min() < 0 or faces.max() >= len(vertices):
         raise InputError(f'a face of the mesh {name!r} names a vertex that does not exist: there are {len(vertices)}')
     if not np.isfinite(vertices[faces]).all():
-        raise InputError(f'a vertex of the mesh {name!r} is not finite: mend or remove it')
+        raise InputError(f'a vertex of the mesh {name!r} is not finite: correct or remove it')
     vertices, faces = _merge(vertices, faces)
     if not len(faces):
         raise InputError(f'the mesh {name!r} has no extent: every face has two corners in one place')

@@ -112,7 +112,7 @@ def taken(path: Path, views: list[_View]) -> Taken:
     n, first = len(views), views[0]
 
     def each(name, count=1):
-        optional = np.zeros(count) if name in _SHIFTS else None  # where the focal spot does not fly
+        optional = np.zeros(count) if name in _SHIFTS else None  # if the focal spot does not fly
         out = [needed(view.file, _named(name), view.values.get(name, optional), count) for view in views]
         return np.stack(out) if count > 1 else np.concatenate(out)
 

@@ -166,7 +166,7 @@ class Sweeps(Algorithm):
         Parameters
         ----------
         folder : path-like
-            For the volume while it is made, twice its size; made if missing. Where the work was stopped, the same call goes on
+            For the volume while it is made, twice its size; made if missing. If the work was stopped, the same call goes on
             after the last whole update, to the same result. The files stay: remove them when the volume is safe.
         progress : Progress or None
             Called after every slab as progress(slabs updated, slabs to update in all, |A x - b| / |b| of the views of this update

@@ -189,7 +189,7 @@ def flush_folder(path: PathLike | str) -> None:
 def replacing(path: PathLike | str) -> Iterator[Path]:
     """Yields a new, empty file beside `path`, which takes its place when the block ends without an error.
 
-    Its content is on the disk before it has its name, so that `path` is the old file or the new one also after a crash. Where
+    Its content is on the disk before it has its name, so that `path` is the old file or the new one also after a crash. If
     `path` is a link, the link is replaced, not what it points to.
 
     Raises

@@ -31,7 +31,7 @@ LOCK = '.lingo_mi.lock'
 def locked(folder: Path | str, name: str = LOCK) -> Iterator[None]:
     """Holds the lock of a folder, which is made if missing; folders that were made and are left empty are removed again.
 
-    The system gives the lock back when its owner ends, however that ends. Where the file system has no such locks, the file
+    The system gives the lock back when its owner ends, however that ends. If the file system has no such locks, the file
     itself is the lock, and the lock of a dead process of this computer is taken over.
 
     Parameters

@@ -32,7 +32,7 @@ from lingo_mi.validation.closed_form import NAMES, rays_and_gradients
 from lingo_mi.validation.oracle import Pose
 from lingo_mi.validation.pairs import count_pairs
 
-EPSILON = 0.0128  # mm, 1e-4 of half the volume's side: where the tree errs least
+EPSILON = 0.0128  # mm, 1e-4 of half the volume's side: the tree's error is smallest there
 VIEWS, WARM_UP = 8, 3
 TRIES = 5  # in a turn; the best of them counts, as in limit.cpp
 PIXELS = 400  # whose errors are measured

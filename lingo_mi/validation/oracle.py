@@ -75,7 +75,7 @@ def random_cloud(
 
 @dataclass(frozen=True)
 class Pose:
-    """One view as in `lingo_mi.geometry.rays.Rays`: `source` is a point, or the beam's unit direction where parallel."""
+    """One view as in `lingo_mi.geometry.rays.Rays`: `source` is a point, or the unit direction of a parallel beam."""
 
     source: np.ndarray
     corner: np.ndarray

@@ -16,7 +16,7 @@ def rows_of(rows: list[dict], stage: str, axis: str) -> list[dict]:
 
 
 def exponents(measured: list[dict]) -> str:
-    """Markdown: the exponent of CPU time by stage and axis; – where nothing depends."""
+    """Markdown: the exponent of CPU time by stage and axis; "–" marks no dependence."""
 
     def cell(axis):
         def text(row):

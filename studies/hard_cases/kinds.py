@@ -29,7 +29,7 @@ class ViewCase:
         Whether derivatives are compared with `closed_form`, since differences of the oracle's float64 are too coarse;
         only for Gaussians far from the ends of the rays.
     note : str
-        What limits the accuracy, where it is less than usual.
+        Reason for an accuracy below the usual one.
     """
 
     name: str

@@ -6,7 +6,7 @@
 Simulated scans are cone beams over a full turn, with 4 as the largest line integral, of objects on --finer times as many voxels
 a side as are reconstructed. The method is fast: all its steps, with the volume compared with the truth every 50; stopped by views
 that it holds out; and with pixels weighed by the noise's standard deviation. Each fit is stored when it is done; the
-same command goes on after an interruption. The table, as Markdown, is renewed after each, with its provenance.
+same command goes on after an interruption. The table, as Markdown, is updated after each, with its provenance.
 """
 
 import argparse
@@ -62,8 +62,8 @@ def main() -> None:
     require_writable(args.out, args.out, 'choose another --out')
     study = Study(args.out, args.size, args.pixels, args.iterations or Fast.iterations)
     cases = [Case(n, p, f, args.views) for f in args.finer for n in names for p in args.photons]
-    with updated_table(args.out / 'noise.md', lambda: study.table(cases)) as renew:
-        study.compute_missing(cases, settings, renew)
+    with updated_table(args.out / 'noise.md', lambda: study.table(cases)) as update:
+        study.compute_missing(cases, settings, update)
 
 
 if __name__ == '__main__':

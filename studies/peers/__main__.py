@@ -1,4 +1,4 @@
-"""Reconstruct one scan by this package's methods and by RTK and MBIRJAX, and compare the volumes where no truth is known.
+"""Reconstruct one scan by this package's methods and by RTK and MBIRJAX, and compare the volumes without a known truth.
 
     python -m studies.peers walnut --views 15 30 60
     python -m studies.peers walnut --views 30 -D voxels=256 -D voxel_size=0.1525 --methods asd-pocs mbirjax best
@@ -8,7 +8,7 @@ Every method gets the same few, evenly spaced views. The table says how well its
 that the scan holds out itself, as root mean square of line integrals in valid pixels; how near it is to the FDK of all views, or
 to the true volume if it is known; and how long it took.
 Each volume is stored as NIfTI when it is done, and the same command goes on after an interruption. The table, as Markdown, is
-renewed after each, with its provenance; slices.png shows the middle slice of all. Settings are defaults, but MBIRJAX's densities
+updated after each, with its provenance; slices.png shows the middle slice of all. Settings are defaults, but MBIRJAX's densities
 are kept from being negative, and refined has what is advised for measured objects: finer=2, niter=4 and no completed views.
 MBIRJAX's sharpness and the beta of RTK's total variation are each chosen among four values by views that are held out, which
 their times include; mbirjax:1 and rtk-tv:10 have the value that they name.
@@ -61,8 +61,8 @@ def main() -> None:
     folder = args.out / '_'.join([Path(args.projections or scene).stem, *map(str, geometry.grid.shape)])
     require_writable(folder, folder, 'choose another --out')
     study = Study(dataset, folder)
-    with updated_table(folder / 'peers.md', lambda: study.table(methods, args.counts)) as renew:
-        study.compute_missing(methods, args.counts, renew)
+    with updated_table(folder / 'peers.md', lambda: study.table(methods, args.counts)) as update:
+        study.compute_missing(methods, args.counts, update)
     study.draw(methods, args.counts, folder / 'slices.png')
     print(folder / 'slices.png')
 

@@ -1,4 +1,4 @@
-"""Volumes of one scan by this package and by its neighbours, compared where no truth is known.
+"""Volumes of one scan by this package and by its neighbours, compared without a known truth.
 
 Every method reconstructs from a few of the measured views. Its volume is measured by what it predicts of the views that are left
 (exact line integrals of its trilinear interpolant), and against a reference: the true volume, or the FDK of all views.
@@ -103,7 +103,7 @@ class Method:
     volume : callable
         The volume [x, y, z] of a scan, or of a scan and a value of the setting.
     setting : str
-        Chosen by held-out views among `values`, where no value is good for every scan.
+        Chosen by held-out views among `values`, because no value is good for every scan.
     """
 
     label: str

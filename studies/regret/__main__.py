@@ -7,7 +7,7 @@
 Simulated scans are cone beams over a full turn, with 4 as the largest line integral, of objects on --finer times as many voxels
 a side as are reconstructed. Settings are ASD-POCS, and the refinement of `best` with 20 passes on the scan's voxels and on half
 their size; with --clouds, which takes minutes a scan, also the volume of a cloud and what starts from it. Each is stored when it
-is done; the same command goes on after an interruption. The table, as Markdown, is renewed after each, with its provenance.
+is done; the same command goes on after an interruption. The table, as Markdown, is updated after each, with its provenance.
 Seconds are CPU seconds of all cores together; for settings with a cloud they include the fit.
 """
 
@@ -61,8 +61,8 @@ def main() -> None:
     ]
     for case in cases:
         study.check(case)
-    with updated_table(args.out / 'regret.md', lambda: study.table(cases)) as renew:
-        study.compute_missing(cases, args.clouds, renew)
+    with updated_table(args.out / 'regret.md', lambda: study.table(cases)) as update:
+        study.compute_missing(cases, args.clouds, update)
 
 
 if __name__ == '__main__':

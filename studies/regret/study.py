@@ -174,7 +174,7 @@ class Study:
         """The Markdown table of the cells that are there, a row a case: dB and processor seconds.
 
         The regret of `Best` counts the fixed settings without a cloud; the regret of `Best(cloud=True)` counts all. Clouds have
-        columns where there are cells of them.
+        columns if there are cells of them.
         """
         cases = list(cases)
         clouds = any(self.get(case, name) for case in cases for name in (*CLOUDS, BEST_CLOUD))

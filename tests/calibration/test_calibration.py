@@ -218,7 +218,7 @@ def test_gain_over_time():
 
 @pytest.mark.thorough
 def test_scattered_light_is_not_negative():
-    """Light that is missing, most of it in the panel's middle, is no scatter: the scan stays as it is, and the lines say why."""
+    """Missing light, mostly in the panel's middle, is not scatter: the scan stays as it is, and the lines say why."""
     scan, _ = responding({'scatter0_0': -0.02, 'scatter0_3': 0.01}, scatter='one')
     calibration = lm.calibrate(scan, scatter=True, progress=False)
     assert calibration.found.measured['scatter0_0'] < -0.01 and not calibration.found.response.parts[0].values.any()

@@ -30,7 +30,7 @@ def fan(tmp_path):
 
 
 def test_the_axis_is_found_and_written(fan, monkeypatch, capsys):
-    out = fan.with_name('mended.npy')
+    out = fan.with_name('corrected.npy')
     run(monkeypatch, fan, '--out', out)
     assert 'shift of the panel along u: -' in capsys.readouterr().out
     before, after = read_scan(fan).train, read_scan(out).train
@@ -45,9 +45,9 @@ def test_the_air_level_is_subtracted(fan, monkeypatch, capsys):
     geometry = scan.geometry
     sound = np.roll(scan.projections, -2, 2)
     write_scan(fan, lm.Scan(geometry, sound + np.float32(0.05)), 'npy')
-    run(monkeypatch, fan, '--out', fan.with_name('mended.npy'))
+    run(monkeypatch, fan, '--out', fan.with_name('corrected.npy'))
     assert 'air beside the object: +0.05 on average' in capsys.readouterr().out
-    np.testing.assert_allclose(read_scan(fan.with_name('mended.npy')).train.projections, sound, atol=2e-3)
+    np.testing.assert_allclose(read_scan(fan.with_name('corrected.npy')).train.projections, sound, atol=2e-3)
 
 
 def test_history_is_kept_and_what_is_left_out_is_said(fan, monkeypatch, tmp_path):

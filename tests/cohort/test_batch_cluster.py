@@ -59,7 +59,7 @@ def require_all_done_once(home):
 
 
 def require_same(home, name, address):
-    """The numbers equal those of an uninterrupted fit on such a worker: to the bit, except on a GPU."""
+    """An uninterrupted fit on such a worker gives the same numbers: to the bit, except on a GPU."""
     record = json.loads((home / 'out' / name / METRICS).read_text())
     rows = (home / 'list.csv').read_text().splitlines()
     (home / 'one.csv').write_text('\n'.join([rows[0], rows[1 + NAMES.index(name)]]))

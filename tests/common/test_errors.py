@@ -25,7 +25,7 @@ def test_a_message_is_one_printable_line(text):
     assert len(brief(text)) < 300 and len(brief(InputError(text))) < 300
 
 
-def test_where_and_mend_stay():
+def test_where_and_the_remedy_stay():
     error = InputError('scan.yml: ' + 'x' * 1000 + '; correct it')
     assert str(error) == 'scan.yml: ' + 'x' * 1000 + '; correct it'
     assert brief(error).startswith('scan.yml: x') and brief(error).endswith('; correct it')

@@ -313,7 +313,7 @@ NAN = np.full((3, 4, 5), np.nan, np.float32)
 BAD = {
     'a list': ([1, 2], 'not a NAF scan'),
     'no train': (plain(train=...), 'not a NAF scan'),
-    'train is no dictionary': (plain(train=3), "'train' must be"),
+    'train is not a dictionary': (plain(train=3), "'train' must be"),
     'no angles': (plain(train={'projections': NAN}), "'train' must be"),
     'no DSO': (plain(DSO=...), 'DSO is missing'),
     'DSD < DSO': (plain(DSD=500.0), 'DSD >= DSO'),

@@ -99,7 +99,7 @@ def test_absent_checkpoint_is_refused(scan, tmp_path):
         run(scan, SHORT, path=tmp_path / 'fit.npz', resume=True)
 
 
-def test_what_renews_something_in_shares_of_its_steps_is_not_made_longer(tmp_path):
+def test_what_updates_something_in_shares_of_its_steps_is_not_made_longer(tmp_path):
     """A gain of the views: half of a longer fit is another fit."""
     scan, path = tiny_scan(geometry()), tmp_path / 'checkpoint.npz'
     method = SHORT.changed(iterations=2, decay_steps=100, fit_gain='view')

@@ -80,7 +80,7 @@ def searched_enough(done, **fields):
 @pytest.mark.parametrize('where', ['search', 'between', pytest.param('fit', marks=pytest.mark.thorough)])
 def test_resumed_it_is_the_same(scan, whole, tmp_path, where, sums_in_order):
     path = tmp_path / 'fit.npz'
-    searched_enough.looks, searched_enough.errors = -1, None  # the first that is shown is no look
+    searched_enough.looks, searched_enough.errors = -1, None  # the first view shown is not a look
     searched_enough.wanted = len(whole.search['errors'])
     progress = dict(search=stop_at(25), between=searched_enough, fit=fitting(20))[where]
     with pytest.raises(KeyboardInterrupt):
@@ -220,7 +220,7 @@ def test_altered_checkpoints(scan, tmp_path, where):
 
 
 def test_views_without_a_valid_pixel_do_not_count(scan, tmp_path):
-    """They are no views to hold out, and a search that sees fewer goes on from its checkpoint."""
+    """They are not views to hold out, and a search that sees fewer goes on from its checkpoint."""
     valid = np.ones(scan.projections.shape, bool)
     valid[3] = False
     path, method = tmp_path / 'fit.npz', METHOD.changed(start='points', fit_air='view')

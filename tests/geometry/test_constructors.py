@@ -59,7 +59,7 @@ def test_circles(make):
 
 @pytest.mark.parametrize('angles', [np.arange(25) * 14.4, np.arange(36) * 10, np.arange(720) / 2])
 def test_angles_in_degrees(angles):
-    """Whole numbers or not; a helix may make many turns, and four turns are no degrees."""
+    """Whole numbers or not; a helix may make many turns, and four turns are not taken for degrees."""
     numbers = CONE | dict(angles=angles)
     with pytest.warns(UserWarning, match=r'turns.* give numpy.radians\(angles\)'):
         Geometry.cone(**numbers)

@@ -323,7 +323,7 @@ def test_lengths_in_other_units(foot):
 
 @pytest.mark.parametrize('level', [0.05, 0.3])
 def test_an_air_level_that_is_not_0(foot, level):
-    """Flats of more exposure than the views, which is no object that fills the panel."""
+    """Flats of more exposure than the views do not look like an object that fills the panel."""
     lifted = replace(foot, projections=foot.projections + np.float32(level * foot.projections.max()))
     assert measure(lifted).border.air == pytest.approx(level * foot.projections.max(), rel=0.02)
     assert [line[:6] for line in advised(lifted)] == ['air is']

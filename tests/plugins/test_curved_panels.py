@@ -19,7 +19,7 @@ def objects():
 
 
 def test_a_cloud():
-    """The image is that of `lm.project`, which other tests compare with single rays."""
+    """The image equals `lm.project`'s, which other tests compare with single rays."""
     scene, cloud = load(dict(cloud=ellipsoids(cloud_of()))), cloud_of()
     geometry = load({}, CURVED).sensors()[0].geometry
     assert isinstance(geometry, CurvedGeometry)

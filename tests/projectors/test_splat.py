@@ -182,7 +182,7 @@ def test_cut_off_bounds_the_error():
 
 
 # ------------------------------------------------------------------------------------------------------------
-#  Where the footprint is no ellipse
+#  Where the footprint is not an ellipse
 # ------------------------------------------------------------------------------------------------------------
 
 AHEAD = -np.array([np.cos(np.radians(33)), np.sin(np.radians(33)), 0])  # from the source to the panel's middle

@@ -69,7 +69,7 @@ def test_fdk(offset, radius):
     level = rectified(measured)
     assert isinstance(level.geometry, CircularGeometry)
     expected = ellipsoids(level.geometry, BALL).projections
-    inside = expected > 0.8 * expected.max()  # the edge is no spline
+    inside = expected > 0.8 * expected.max()  # the edge is not a spline
     assert np.abs(level.projections - expected)[inside].max() < 3e-3 * expected.max()
 
 

@@ -377,7 +377,7 @@ def test_refined_puts_what_is_missing_where_the_structure_is():
 
 def test_smaller_voxels_hold_what_an_object_has_between_them():
     """An object scanned on half the voxels' size: on its own voxels `refined` makes less of it than on the smaller ones, whose
-    means it gives, from a start that is no better."""
+    means it gives, from a start that is not better."""
     made = phantoms.make('foot', 48)
     geo = default_geometry(made, circular(30, 180.0), 96)
     scan = Scan(geo, project_volume(made.data, geo))

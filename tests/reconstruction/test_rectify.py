@@ -64,7 +64,7 @@ def test_the_line_integrals_are_those_of_the_same_rays(mode):
         ellipsoids(moved(geo, TURNS['all'], offDetector=np.random.default_rng(0).normal(0, 5, (7, 2))), BALL)
     )
     expected = ellipsoids(scan.geometry, BALL).projections
-    inside = expected > 0.8 * expected.max()  # a pixel off would be 6 % there; the edge is no spline
+    inside = expected > 0.8 * expected.max()  # a shift by a pixel would be 6 % there; the edge is not a spline
     assert np.abs(scan.projections - expected)[inside].max() < 2e-3 * expected.max()
     np.testing.assert_allclose(scan.geometry.rays().source, geo.rays().source, atol=1e-9)
 

@@ -100,7 +100,7 @@ def test_cgls_with_the_same_operators(monkeypatch, niter):
 
 @pytest.mark.parametrize('niter, tolerance', [(1, 0.001), (2, 0.01), (4, 0.02)])
 def test_cgls(niter, tolerance):
-    """Residuals; measured were 0.006, 0.6 and 1.5 %. RTK goes back by a sum over voxels, which is no transpose, and its
+    """Residuals; measured were 0.006, 0.6 and 1.5 %. RTK goes back by a sum over voxels, which is not the transpose, and its
     projector weighs the voxels at the border, which the first gradient fills, in its own way."""
     geo = geometry(angles=circular(20, start=3), offDetector=(0.0, 0.0))
     scan = ellipsoids(geo, *BODIES)

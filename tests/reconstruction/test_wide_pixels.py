@@ -67,7 +67,7 @@ def test_voxels_between_rays(algorithm):
 
 
 def test_wide_pixels_leave_no_pattern():
-    """Pixels twice as wide as the voxels: a start that is right but for something smooth is mended smoothly."""
+    """Pixels twice as wide as the voxels: a start with a smooth error is corrected smoothly."""
     made = phantoms.make('foot', 48)
     geo = default_geometry(made, circular(12, 180.0), 24)
     assert min(excess_width(geo)) > 0.5

@@ -242,7 +242,7 @@ def asked(live, seen=0, place=''):
     """Return the answer of the server to the page."""
     status, _, text = get(live, f'/state?{token(live)}&seen={seen}&history={place}')
     assert status == 200
-    return json.loads(text, parse_constant=pytest.fail)  # NaN and Infinity are no JSON
+    return json.loads(text, parse_constant=pytest.fail)  # NaN and Infinity are not JSON
 
 
 def test_a_page_is_told_what_it_does_not_know(live, data):

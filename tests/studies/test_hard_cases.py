@@ -430,7 +430,7 @@ def test_inverses_at_both_ends():
 
 @pytest.mark.parametrize('length', [1e-14, 1e-7, 1e7, 1e14])
 def test_length_of_a_quaternion_does_not_matter(length):
-    """Only its own derivative is the other way round, so that a step of Adam is no danger near zero."""
+    """Only its own derivative is the other way round, so that a step of Adam is harmless near zero."""
     frames, shape = scanner()
     cloud, weights = random_cloud(np.random.default_rng(1), 4), weights_of(shape)
     cloud = cloud.changed(rotation=cloud.rotation / np.linalg.norm(cloud.rotation, axis=1, keepdims=True))

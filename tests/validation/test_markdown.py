@@ -1,4 +1,4 @@
-"""Tables in Markdown and their places in documents, and which documents the commands renew."""
+"""Tables in Markdown and their places in documents, and which documents the commands update."""
 
 import pytest
 

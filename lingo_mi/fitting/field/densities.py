@@ -20,7 +20,7 @@ def largest_density(scan: Scan) -> float:
     """A bound of a scan's densities, 1/mm: 1.5 times what an FDK volume exceeds in one voxel of 10,000.
 
     NAF is given volumes with densities from 0 to 1. With 5 to 25 views of the phantoms and test volumes the bound is 1.2 to 2.5
-    times the largest true density. Where FDK cannot reconstruct the scan, it is ten times the largest line integral over half the
+    times the largest true density. If FDK cannot reconstruct the scan, it is ten times the largest line integral over half the
     volume's longest side.
 
     Raises

@@ -57,7 +57,7 @@ def integrals(
     samples : int
         On a ray, one in each of as many equal parts of its way through the volume.
     within
-        Where in its part a sample is, from 0 to 1: Float [rays * samples], ray by ray, or a number.
+        Position of a sample in its part, from 0 to 1: Float [rays * samples], ray by ray, or a number.
     """
     walk, length = pixel_walk(cube.geometry, row, x, y)
     begin, step = walk.t_first, dr.maximum(walk.t_last - walk.t_first, 0) / samples

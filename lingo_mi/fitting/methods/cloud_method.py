@@ -41,7 +41,7 @@ class CloudMethod(Method):
     iterations, batch, view_order, checkpoint_seconds, stopping, rates
         See `Method`.
     start : Start
-        Where the Gaussians start.
+        Start of the Gaussians.
     loss : ImageLoss
         What is compared with the measured views.
     densify : Densify

@@ -98,7 +98,7 @@ class XGaussian(GaussianSplatting):
     """X-Gaussian: the same radiance in all directions, a regular grid for a start, the released settings of its foot scan.
 
     Its code divides every view by its own maximum. Here one maximum is taken for all, so that views stay comparable. The options
-    are those of `GaussianSplatting`.
+    are the same as for `GaussianSplatting`.
 
     References
     ----------

@@ -24,7 +24,7 @@ class Rates(Part):
     beta1, beta2 : float
         Decay of the moments (R2-Gaussian: Adam's usual 0.9 and 0.999).
     nesterov : bool
-        Whether a step goes where the first moment will point after the next one (Dozat, "Incorporating Nesterov momentum into
+        Whether a step goes in the direction of the first moment after the next one (Dozat, "Incorporating Nesterov momentum into
         Adam", 2016).
     epsilon : float
         Added to the root of the second moment (R2-Gaussian: 1e-15).

@@ -14,7 +14,7 @@ class Sizes:
     gaussians, pixels, box
         The cloud, the side of its square panel, mean pixels in a box of 3 standard deviations.
     few : int
-        Gaussians of the same kind where slow methods take part.
+        Gaussians of the same kind if slow methods take part.
     grids : tuple
         Voxels along a side of the grids.
     rounds, seconds
