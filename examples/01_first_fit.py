@@ -34,14 +34,14 @@ fit
 # A volume on the voxels of the scan, and line integrals in any view. Here is a slice, [y, z] at the middle x, beside the truth.
 
 
-def compare(truth, found, titles, label, **options):
+def compare(truth, result, titles, label, **options):
     """Two images on one scale, and their difference on a tenth of it."""
     fig, axes = plt.subplots(1, 3, figsize=(10, 3.6), layout='constrained')
     top = truth.max()
-    for axis, image, title in zip(axes, (truth, found), titles):
+    for axis, image, title in zip(axes, (truth, result), titles):
         gray = axis.imshow(image, cmap='gray', vmin=0, vmax=top, **options)
         axis.set(title=title, xticks=[], yticks=[])
-    signed = axes[2].imshow(found - truth, cmap='RdBu_r', vmin=-top / 10, vmax=top / 10, **options)
+    signed = axes[2].imshow(result - truth, cmap='RdBu_r', vmin=-top / 10, vmax=top / 10, **options)
     axes[2].set(title='difference', xticks=[], yticks=[])
     fig.colorbar(gray, ax=axes[:2], label=label)
     fig.colorbar(signed, ax=axes[2], label=label)

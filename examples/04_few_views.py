@@ -43,9 +43,9 @@ volumes = {
 
 fig, axes = plt.subplots(2, 3, figsize=(9, 6.6), layout='constrained')
 shown = {'truth': foot.data}
-for name, found in volumes.items():
-    numbers = found.metrics() if found is fit else found.metrics(foot.data)
-    shown[f'{name}, {numbers["psnr_3d"]:.1f} dB'] = np.asarray(found)
+for name, result in volumes.items():
+    numbers = result.metrics() if result is fit else result.metrics(foot.data)
+    shown[f'{name}, {numbers["psnr_3d"]:.1f} dB'] = np.asarray(result)
 for axis, (title, volume) in zip(axes.flat, shown.items()):
     axis.imshow(volume[32].T, origin='lower', cmap='gray', vmin=0, vmax=foot.data.max())
     axis.set(title=title, xticks=[], yticks=[])

@@ -19,8 +19,8 @@ foot = lm.phantom('foot', size=64)
 count = 24
 angles = np.linspace(-2 * np.pi, 2 * np.pi, count, endpoint=False)
 scanner = dict(DSO=1000, DSD=1500, nDetector=(96, 96), dDetector=(6, 6))
-told = lm.Geometry.helix(**scanner, grid=foot.grid, angles=angles, pitch=60)
-told
+nominal = lm.Geometry.helix(**scanner, grid=foot.grid, angles=angles, pitch=60)
+nominal
 
 # %%
 # What it really does: every view is turned and shifted a little. What all views have in common is taken off, for that is a
@@ -29,18 +29,18 @@ told
 rng = np.random.default_rng(1)
 turns, shifts = rng.normal(0, 1, (count, 3)), rng.normal(0, 2, (count, 3))  # degrees, mm
 turns, shifts = turns - turns.mean(0), shifts - shifts.mean(0)
-moved = told.rays().moved(Rotation.from_rotvec(np.radians(turns)).as_matrix(), shifts)
-real = lm.Geometry.from_poses(moved, told.nDetector, grid=foot.grid)
+moved = nominal.rays().moved(Rotation.from_rotvec(np.radians(turns)).as_matrix(), shifts)
+real = lm.Geometry.from_poses(moved, nominal.nDetector, grid=foot.grid)
 measured = lm.simulate(foot, real)
-misled = lm.Dataset(lm.Scan(told, measured.train.projections), volume=foot.data)
+misled = lm.Dataset(lm.Scan(nominal, measured.train.projections), volume=foot.data)
 
 # %%
-# Fits of the same projections with the poses as told, with these poses corrected (`rate_pose`: first and last step size), and,
+# Fits of the same projections with the nominal poses, with these poses corrected (`rate_pose`: first and last step size), and,
 # for comparison, with the real ones.
 
 short = dict(iterations=400, n_points=3000)
 fits = {
-    'as told': lm.fit(misled, 'fast', **short),
+    'nominal': lm.fit(misled, 'fast', **short),
     'corrected': lm.fit(misled, 'fast', **short, rate_pose=(1e-2, 1e-3)),
     'real poses': lm.fit(measured, 'fast', **short),
 }

@@ -45,8 +45,8 @@ for _ in range(50):
 # %%
 # The same matrix for SciPy, here with a little damping.
 
-found = lsqr(A.aslinearoperator(), b.ravel(), damp=0.02 * A.norm(), iter_lim=50)[0]
-least_squares = found.reshape(A.domain_shape)
+solution = lsqr(A.aslinearoperator(), b.ravel(), damp=0.02 * A.norm(), iter_lim=50)[0]
+least_squares = solution.reshape(A.domain_shape)
 
 # %%
 # A denoiser after each step of gradient descent, with Nesterov's momentum. Any function may take its place (plug and play).

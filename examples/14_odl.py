@@ -68,8 +68,8 @@ odl.solvers.pdhg(
 # How good they are.
 
 figure, axes = plt.subplots(1, 3, figsize=(8, 2.8), layout='constrained')
-found = {'truth': chest.data, 'CGLS': cgls.asarray(), 'TV by PDHG': tv.asarray()}
-for ax, (name, volume) in zip(axes, found.items()):
+shown = {'truth': chest.data, 'CGLS': cgls.asarray(), 'TV by PDHG': tv.asarray()}
+for ax, (name, volume) in zip(axes, shown.items()):
     error = np.mean((volume - chest.data) ** 2)
     decibels = '' if name == 'truth' else f'{10 * np.log10(chest.data.max() ** 2 / error):.1f} dB'
     ax.imshow(volume[:, :, 16].T, cmap='gray', vmin=0, vmax=chest.data.max())

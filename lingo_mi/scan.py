@@ -120,13 +120,13 @@ class Scan:
                 'effects of a detector are modelled on flat panels alone: give line integrals without effects'
             )
         expected = (len(self.geometry), *self.geometry.nDetector)
-        given: Any = self.projections
-        if isinstance(given, StoredViews) and self.valid is None and self.effects is None:
-            object.__setattr__(self, 'stored', given)
+        projections: Any = self.projections
+        if isinstance(projections, StoredViews) and self.valid is None and self.effects is None:
+            object.__setattr__(self, 'stored', projections)
             object.__delattr__(self, 'projections')
-            p = given
+            p = projections
         else:
-            p = as_numpy(given, 'the projections', np.float32)
+            p = as_numpy(projections, 'the projections', np.float32)
         if p.shape != expected:
             raise InputError(
                 f'the projections have the shape {p.shape}, but the geometry says [view, v, u] = {expected}'

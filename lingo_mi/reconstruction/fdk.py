@@ -360,8 +360,8 @@ class FilteredViews:
             algorithm, scan = self.at
             images = algorithm.images(scan)[0]
         else:
-            found = np.load(self.at, mmap_mode='r') if isinstance(self.at, Path) else self.at
-            images = partial(_batch, found)
+            stored = np.load(self.at, mmap_mode='r') if isinstance(self.at, Path) else self.at
+            images = partial(_batch, stored)
         return backprojected(self.geometry.on(self.geometry.grid.slab(*part)), images, progress)
 
 
