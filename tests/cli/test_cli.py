@@ -240,8 +240,9 @@ def wait_for(process, condition, seconds=300):
 
 
 @pytest.mark.posix
+@pytest.mark.thorough
 def test_resume_after_kill(scene, tmp_path):
-    """`kill -9` in the middle, then --resume: the same numbers as without the interruption."""
+    """`kill -9` in the middle, then --resume: the same numbers as without the interruption. `test_crashes` has a shorter one."""
     out, whole = tmp_path / 'a', tmp_path / 'whole'
     in_its_own_process(scene, '--iterations', '60', '--out', whole, *SMALL)
     arguments = scene, '--iterations', '60', '--out', out, *SMALL
@@ -283,7 +284,7 @@ def test_resume_after_kills_in_a_search(scene, tmp_path):
 def test_interrupt_leaves_a_checkpoint(scene, tmp_path):
     out = tmp_path / 'a'
     # It says how far it is after a tenth, and would go on for nine times as long; no checkpoint but the one that Ctrl-C leaves.
-    process = fit_process(scene, '--iterations', '5000', '--out', out, *SMALL, '-D', 'checkpoint_seconds=1e9')
+    process = fit_process(scene, '--iterations', '2000', '--out', out, *SMALL, '-D', 'checkpoint_seconds=1e9')
     line = ''
     while not line.startswith('Fit: '):
         line = process.stderr.readline()

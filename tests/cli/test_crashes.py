@@ -18,6 +18,7 @@ import pytest
 from helpers.fault_server import Server
 from helpers.script import SCENE
 from lingo_mi.files.volumes import read_volume
+from lingo_mi.fitting.checkpoint import Checkpoint
 from lingo_mi.storage.output_folder import CHECKPOINT, METRICS, digest
 
 pytestmark = pytest.mark.posix
@@ -38,6 +39,13 @@ FIT = (
     'densify_every=2',
 )
 MINE = 'notes.txt', '.writable', 'metrics.json.partial', 'views/mine.exr'
+
+
+def tiny():
+    scene = SCENE
+    for old, new in TINY:
+        scene = scene.replace(old, new)
+    return scene
 
 
 @dataclass
@@ -63,11 +71,8 @@ class Bench:
     def __init__(self, server, home):
         self.server, self.home, self.box = server, home, home / 'box'
         self.out, self.volume, self.tables = self.box / 'result', self.box / 'volume.nii', self.box / 'tables'
-        scene = SCENE
-        for old, new in TINY:
-            scene = scene.replace(old, new)
         self.scene = home / 'tiny.xml'
-        self.scene.write_text(scene)
+        self.scene.write_text(tiny())
         self.seeds = {seed: self.fit(seed) for seed in (0, 1)}
         self.metrics = {}
         for seed, command in self.seeds.items():
@@ -247,6 +252,24 @@ def try_points(bench, count):
     took = time.monotonic() - began
     print(f'{len(chosen)} of {len(points)} points in {took:.0f} s: {len(failed)} failed')
     assert not failed, '\n'.join(f'{name}: {error}' for name, error in failed.items())
+
+
+def test_a_killed_fit_goes_on_to_the_same_numbers(tmp_path):
+    """`kill -9` half way through what it writes, then --resume."""
+    scene, whole, out = tmp_path / 'tiny.xml', tmp_path / 'whole', tmp_path / 'result'
+    scene.write_text(tiny())
+    with Server() as server:
+        code, err, calls = server.run('fit', [scene, *FIT, '--out', whole], whole)
+        assert code == 0, err
+        command = [scene, *FIT, '--out', out]
+        code, _, _ = server.run('fit', command, out, calls // 2)
+        assert code == -signal.SIGKILL and not (out / METRICS).exists()
+        assert 0 < Checkpoint.load(out / CHECKPOINT).iteration < 5
+        code, err, _ = server.run('fit', [*command, '--resume'])
+        assert code == 0, err
+    expected, resumed = (json.loads((folder / METRICS).read_text()) for folder in (whole, out))
+    assert [resumed[key] for key in KEYS] == pytest.approx([expected[key] for key in KEYS], rel=1e-4)
+    assert [h['iteration'] for h in resumed['history']] == [h['iteration'] for h in expected['history']]
 
 
 @pytest.mark.thorough

@@ -130,7 +130,9 @@ def test_local_workers(home, number):
     assert len({line.split(': ')[1] for line in events(home, 'began')}) == number
 
 
+@pytest.mark.thorough
 def test_workers_that_cannot_do_it(home):
+    """`tests/jobs/test_worker.py` has all that is refused."""
     with cluster(home, workers=1, threads_of_tasks=2) as (address, _):
         code, _, err = run(BATCH, *arguments(home, address))
     assert code == 2 and 'runs 2 tasks at once' in err and err.count('\n') == 1

@@ -231,8 +231,15 @@ def test_no_kernel_is_compiled_after_the_first_steps():
     assert not {i: len(hashes) for i, hashes in fresh.items() if i > 5 and hashes}
 
 
-@pytest.mark.parametrize('masked', [False, True])
-@pytest.mark.parametrize('changes', [dict(loss_scale='dynamic', batch=2), dict(loss_scale='statistic')])
+@pytest.mark.parametrize(
+    'changes, masked',
+    [
+        (dict(loss_scale='dynamic', batch=2), True),
+        (dict(loss_scale='statistic'), False),
+        pytest.param(dict(loss_scale='dynamic', batch=2), False, marks=pytest.mark.thorough),
+        pytest.param(dict(loss_scale='statistic'), True, marks=pytest.mark.thorough),
+    ],
+)
 def test_replayed_steps_are_the_traced_ones(scan, changes, masked, sums_in_order):
     """To the last bit, through densifications."""
     method = SHORT.changed(iterations=20, densify_from=0, densify_every=5, **changes)

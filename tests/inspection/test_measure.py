@@ -9,6 +9,7 @@ from scipy import ndimage
 
 import lingo_mi as lm
 from helpers.object_scan import PIXELS, scanned
+from helpers.short import short
 from lingo_mi.cli.findings_text import advice, facts
 from lingo_mi.inspection.air import without_air
 from lingo_mi.inspection.jitter import outline_jitter
@@ -26,21 +27,31 @@ def foot():
     return scanned('foot')
 
 
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
-@pytest.mark.parametrize(
-    'name',
-    [
-        'foot',
-        'shepp_logan',
-        pytest.param('chest', marks=pytest.mark.thorough),
-        pytest.param('gaussians', marks=pytest.mark.slow),
-    ],
+SOUND = {
+    f'{name}, {mode}, {views} views over {total} degrees': (name, mode, total, views)
+    for name in ('foot', 'shepp_logan', 'chest')
+    for mode in ('cone', 'parallel')
+    for total, views in ((360, 10), (360, 25), (180, 25), (220, 60))
+}
+SHORT = (
+    'foot, cone, 10 views over 360 degrees',
+    'foot, cone, 25 views over 180 degrees',
+    'foot, parallel, 60 views over 220 degrees',
+    'shepp_logan, cone, 10 views over 360 degrees',
+    'shepp_logan, parallel, 25 views over 180 degrees',
 )
-@pytest.mark.parametrize(
-    ('total', 'views'), [(360, 10), pytest.param(360, 25, marks=pytest.mark.thorough), (180, 25), (220, 60)]
-)
+
+
+@pytest.mark.parametrize('name, mode, total, views', short(SOUND, SHORT))
 def test_a_sound_scan_raises_no_alarm(name, mode, total, views):
     assert advised(scanned(name, mode, views, total)) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize(('total', 'views'), [(360, 10), (360, 25), (180, 25), (220, 60)])
+def test_a_sound_scan_of_gaussians_raises_no_alarm(mode, total, views):
+    assert advised(scanned('gaussians', mode, views, total)) == []
 
 
 def only(scan, words):
@@ -75,8 +86,14 @@ def test_doubled_and_black_views(foot):
     assert only(lm.Scan(foot.geometry, p), 'view 7 is black or empty').suspects == [7]
 
 
-@pytest.mark.parametrize('first', [0, 1])
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+@pytest.mark.parametrize(
+    'mode, first',
+    [
+        ('cone', 1),
+        ('parallel', 0),
+        *(pytest.param(*other, marks=pytest.mark.thorough) for other in (('cone', 0), ('parallel', 1))),
+    ],
+)
 def test_frames_sorted_by_name(mode, first):
     """Names in the order of text are 0, 1, 10, 11, ..."""
     scan = scanned('chest', mode, views=60)
@@ -95,8 +112,14 @@ def test_views_of_any_other_order_are_not_sorted_by_name():
     assert text_order(lm.Scan(scan.geometry, scan.projections[shuffled])) is None
 
 
-@pytest.mark.parametrize('columns', [[30], [47, 48, 49]])
-@pytest.mark.parametrize('noise', [0, 0.002])
+@pytest.mark.parametrize(
+    'noise, columns',
+    [
+        (0, [30]),
+        (0.002, [47, 48, 49]),
+        *(pytest.param(*other, marks=pytest.mark.thorough) for other in ((0, [47, 48, 49]), (0.002, [30]))),
+    ],
+)
 def test_dead_columns(foot, columns, noise):
     p = foot.projections + noise * np.random.default_rng(0).normal(size=foot.projections.shape) * foot.projections.max()
     assert measure(lm.Scan(foot.geometry, p)).dead_columns == []
@@ -130,8 +153,15 @@ def noisy(p, level, kind):
     return -np.log(np.maximum(rng.poisson(np.exp(-3 * p / p.max()) / level**2), 0.5) * level**2)
 
 
-@pytest.mark.parametrize(('mode', 'kind'), [('cone', 'equal'), ('parallel', 'photons')])
-@pytest.mark.parametrize('level', [0.01, pytest.param(0.02, marks=pytest.mark.thorough), 0.05])
+@pytest.mark.parametrize(
+    'mode, kind, level',
+    [
+        ('cone', 'equal', 0.05),
+        ('parallel', 'photons', 0.01),
+        *(pytest.param('cone', 'equal', level, marks=pytest.mark.thorough) for level in (0.01, 0.02)),
+        *(pytest.param('parallel', 'photons', level, marks=pytest.mark.thorough) for level in (0.02, 0.05)),
+    ],
+)
 def test_noisy_pixels_are_not_the_object(mode, level, kind):
     """Neither at the edge, nor where the axis is measured; an object that is there is found in as many views."""
     scan = scanned('foot', mode, 60)
@@ -211,7 +241,7 @@ def test_a_small_drift_of_air_names_calibrate(foot):
     assert actual.orbit.disagreement == pytest.approx(measure(foot).orbit.disagreement, abs=0.001)
 
 
-@pytest.mark.parametrize('level', [0.02, -0.02])
+@pytest.mark.parametrize('level', [0.02, pytest.param(-0.02, marks=pytest.mark.thorough)])
 def test_a_drift_of_air_does_not_change_the_sense(level):
     scan = scanned('foot', views=60)
     p = scan.projections / scan.projections.max() + np.linspace(-level, level, 60)[:, None, None]

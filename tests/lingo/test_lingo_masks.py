@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from helpers.circles import circle
+from helpers.short import short
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.camera import camera_matrices
 from lingo_mi.geometry.trajectories import circular
@@ -152,8 +153,15 @@ def test_voxel_centres():
     np.testing.assert_allclose(voxel_centres((2, 3, 4), (1, 0.6, 0.4), [13]), centres[1, 0, 1][None])
 
 
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
-@pytest.mark.parametrize('misses, outside', [(0, 'invalid'), (2, 'invalid'), (0, 'ignore'), (1, 'ignore')])
+FILTERS = {
+    f'{mode}, {misses} misses, {outside}': (mode, misses, outside)
+    for mode in ('cone', 'parallel')
+    for misses, outside in ((0, 'invalid'), (2, 'invalid'), (0, 'ignore'), (1, 'ignore'))
+}
+SHORT = 'cone, 0 misses, invalid', 'cone, 1 misses, ignore', 'parallel, 2 misses, invalid'
+
+
+@pytest.mark.parametrize('mode, misses, outside', short(FILTERS, SHORT))
 def test_valid_voxels(monkeypatch, mode, misses, outside):
     geometry = scan(mode, dDetector=(0.1037, 0.0911), nVoxel=(9, 7, 6))  # panel too small
     frames, grid = geometry.normalised_rays(), geometry.grid.shape

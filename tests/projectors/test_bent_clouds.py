@@ -7,6 +7,7 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from helpers.short import short
 from lingo_mi.functional import GaussianProjector, project
 from lingo_mi.geometry import CurvedGeometry, Geometry, Grid, PosedGeometry
 from lingo_mi.projectors.cloud import line_integrals
@@ -47,6 +48,9 @@ SCANNERS = {
 }
 
 
+SHORT = 'about the focal spot', 'a wide radius', 'shaken', 'few columns'
+
+
 @pytest.fixture(params=SCANNERS)
 def scanner(request):
     return SCANNERS[request.param]
@@ -82,8 +86,9 @@ def cloud_of(name='random', n=40):
 @pytest.mark.parametrize(
     'scanner, name',
     [
-        *((scanner, 'random') for scanner in SCANNERS),
+        *((scanner, 'random') for scanner in SHORT),
         ('wide', 'needles'),
+        *(pytest.param(s, 'random', marks=pytest.mark.thorough) for s in SCANNERS if s not in SHORT),
         *(pytest.param(s, 'needles', marks=pytest.mark.thorough) for s in SCANNERS if s != 'wide'),
     ],
     indirect=['scanner'],
@@ -141,6 +146,7 @@ def test_tangents(scanner):
     assert abs(actual - expected) < 1e-5 * np.linalg.norm(tangent) * np.linalg.norm(weights)
 
 
+@pytest.mark.parametrize('scanner', short({name: name for name in SCANNERS}, SHORT), indirect=True)
 def test_rigid_motions(scanner):
     """The derivative by a turn and a shift of source and panel together."""
     cloud, rays = cloud_of(), scanner.rays(curved=True)

@@ -7,36 +7,50 @@ import pytest
 from helpers.grids import scan
 from helpers.matrices import assert_kernels_serve_any_views, assert_pair, device_images, matrix
 from helpers.motions import climbing, posed, reversed_panel, shaken, turned
+from helpers.short import short
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.projectors.grid import project_volume
 from lingo_mi.projectors.joseph import Joseph
 from lingo_mi.projectors.stack import Stack
 
-POSED = [
-    *(posed(motion) for motion in (climbing, shaken, turned, reversed_panel)),
-    *(posed(motion, 'parallel') for motion in (climbing, shaken, turned)),
-]
-GEOMETRIES = [
-    dict(),
-    dict(mode='parallel'),
-    dict(nVoxel=(9, 11, 1)),
-    dict(mode='parallel', nVoxel=(1, 8, 7)),
-    dict(nDetector=(1, 21)),
-    dict(DSO=400.0, DSD=400.0),
-    dict(dDetector=(9.0, 8.0)),
-    dict(dDetector=(1.0, 1.1)),
-]
+POSED = {
+    **{motion.__name__: posed(motion) for motion in (climbing, shaken, turned, reversed_panel)},
+    **{f'{motion.__name__} parallel': posed(motion, 'parallel') for motion in (climbing, shaken, turned)},
+}
+CHANGES = {
+    'cone': dict(),
+    'parallel': dict(mode='parallel'),
+    'one slice': dict(nVoxel=(9, 11, 1)),
+    'one sheet': dict(mode='parallel', nVoxel=(1, 8, 7)),
+    'one row': dict(nDetector=(1, 21)),
+    'panel at the axis': dict(DSO=400.0, DSD=400.0),
+    'wide pixels': dict(dDetector=(9.0, 8.0)),
+    'narrow pixels': dict(dDetector=(1.0, 1.1)),
+}
+SHORT = (
+    'cone',
+    'parallel',
+    'one slice',
+    'one sheet',
+    'one row',
+    'wide pixels',
+    'shaken',
+    'reversed_panel',
+    'climbing parallel',
+)
 
 
-@pytest.mark.parametrize('geometry', [*(scan(n=3, **changes) for changes in GEOMETRIES), *POSED])
+@pytest.mark.parametrize(
+    'geometry', short({name: scan(n=3, **changes) for name, changes in CHANGES.items()} | POSED, SHORT)
+)
 def test_against_the_transcription(geometry):
     dense = matrix(geometry)
     for masked in (False, True):
         assert_pair(Joseph, geometry, dense, masked)
 
 
-@pytest.mark.parametrize('changes', [*GEOMETRIES, dict(offOrigin=(0.0, 0.0, 0.0), offDetector=(0.0, 0.0), n=8)])
+@pytest.mark.parametrize('changes', [*CHANGES.values(), dict(offOrigin=(0.0, 0.0, 0.0), offDetector=(0.0, 0.0), n=8)])
 def test_transpose(changes):
     geometry = scan(**changes)
     J, rng = Joseph(geometry), np.random.default_rng(1)

@@ -7,6 +7,7 @@ import pytest
 from helpers.grids import scan
 from helpers.matrices import assert_kernels_serve_any_views, assert_pair, device_images, matrix
 from helpers.motions import climbing, posed, reversed_panel, rolled, shaken, tilted, turned
+from helpers.short import short
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry.grid import Grid
 from lingo_mi.projectors.grid import project_volume
@@ -31,9 +32,21 @@ GEOMETRIES = {
     'narrow pixels': scan(n=3, dDetector=(1.0, 1.1)),
     'close': scan(n=3, DSO=45.0, DSD=60.0),
 }
+SHORT = (
+    f'{STEEP} parallel',
+    f'{ALONG_Z} cone',
+    'rolled parallel',
+    'shaken',
+    'reversed_panel',
+    'one slice',
+    'one sheet',
+    'one row',
+    'wide pixels',
+    'close',
+)
 
 
-@pytest.mark.parametrize('geometry', GEOMETRIES.values(), ids=GEOMETRIES)
+@pytest.mark.parametrize('geometry', short(GEOMETRIES, SHORT))
 def test_against_the_transcription(geometry):
     dense = matrix(geometry, axes=3)
     for masked in (False, True):

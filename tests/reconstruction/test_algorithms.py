@@ -207,7 +207,9 @@ def test_a_bar(scan, capsys):
     assert 'first look: 5/5 (100%)' in capsys.readouterr().err
 
 
-@pytest.mark.parametrize('name', ALGORITHMS)
+@pytest.mark.parametrize(
+    'name', [pytest.param(n, marks=pytest.mark.thorough) if n == 'best' else n for n in ALGORITHMS]
+)  # `best` by command is its run, too
 def test_the_front_door_is_the_run(scan, name):
     arrays = inputs(name, scan)
     result = lm.reconstruct(scan, quick(name), progress=False, **arrays)

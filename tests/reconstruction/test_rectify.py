@@ -1,11 +1,13 @@
 """FDK of panels that are turned, tilted or off the central ray: against upright panels, the analytic ball, what is refused."""
 
 import functools
+import itertools
 
 import numpy as np
 import pytest
 
 from helpers.balls import BALL, assert_ball, centres, ellipsoids, geometry
+from helpers.short import short
 from lingo_mi.common.errors import InputError
 from lingo_mi.geometry import CircularGeometry, Geometry, PosedGeometry
 from lingo_mi.geometry.trajectories import circular, helix
@@ -35,13 +37,16 @@ def upright(mode, columns, offset):
     return geo, run_algorithm(ellipsoids(geo, *BODIES), FDK()).volume
 
 
-@pytest.mark.parametrize(
-    'columns, offset', [(72, -7.0), (40, 50.0), pytest.param(40, -50.0, marks=pytest.mark.thorough)]
-)
-@pytest.mark.parametrize(
-    'turn', ['yaw', 'all', *(pytest.param(t, marks=pytest.mark.thorough) for t in ('roll', 'pitch'))]
-)
-@pytest.mark.parametrize('mode', ['cone', 'parallel'])
+MOVED = {
+    f'{mode}, {turn}, {columns} columns at {offset}': (mode, turn, columns, offset)
+    for mode, turn, (columns, offset) in itertools.product(
+        ('cone', 'parallel'), TURNS, ((72, -7.0), (40, 50.0), (40, -50.0))
+    )
+}
+SHORT = 'cone, yaw, 40 columns at 50.0', 'cone, all, 40 columns at 50.0', 'parallel, all, 72 columns at -7.0'
+
+
+@pytest.mark.parametrize('mode, turn, columns, offset', short(MOVED, SHORT))
 def test_as_from_an_upright_panel(mode, turn, columns, offset):
     """Centred on the axis but for some pixels, and half a panel beside it. Both volumes miss the sharp bodies by 4 to 5 %."""
     geo, expected = upright(mode, columns, offset)

@@ -221,15 +221,16 @@ def test_page_says_it_all(written):
 @pytest.mark.parametrize(
     'changes, images',
     [
-        (dict(truth=None, views_truth=None), 4),
+        pytest.param(dict(truth=None, views_truth=None), 4, marks=pytest.mark.thorough),
         (dict(views=None, views_truth=None, cloud_centres=None, metrics={}), 1),
-        (
+        pytest.param(
             dict(
                 cloud_centres=np.zeros((0, 3)),
                 cloud_density=np.zeros(0),
                 metrics=dict(history=[dict(iteration=1, loss=None, psnr_2d=float('nan'))]),
             ),
             2,
+            marks=pytest.mark.thorough,
         ),
         (
             dict(

@@ -68,8 +68,30 @@ LONG = (
 )
 
 
+# Between cases that the short form runs, or the other beam of one that it runs.
+LIKE = {
+    *('pancakes 1:1e4, parallel, whole', 'pancakes 1:1e4 seen edge on, cone', 'needles 1:1e4 seen end on, parallel'),
+    *('1 x 4096 pixels, cone', '4096 x 1 pixels, parallel', 'projections with negative values'),
+    *(
+        'scale 1e0 pixels, parallel',
+        'scale 1e-1 pixels, cone',
+        'scale 1e-1 pixels, parallel',
+        'scale 1e-2 pixels, parallel',
+    ),
+    *('scale 1e-4 pixels, cone', 'voxels: scale 1e-2 voxels', 'voxels: scale 1e-4 voxels', 'voxels: pancakes 1:1e4'),
+    *('density 1e-12, parallel', 'density 0, parallel', 'density 1e+06, parallel'),
+    *('quaternions of length 1e+12, parallel', 'quaternions of length 1e-12, cone'),
+    *('view at 0.5759587 rad, parallel', 'view at 0.5759597 rad, cone', 'view at 0.5759597 rad, parallel'),
+    *('world offset of 1e+04 scenes, parallel', 'world offset of 1e+06 scenes, cone'),
+}
+
+
 def marked(case):
-    return pytest.param(case, marks=pytest.mark.thorough if case.name in LONG else (), id=case.name)
+    return pytest.param(case, marks=pytest.mark.thorough if case.name in {*LONG, *LIKE} else (), id=case.name)
+
+
+def test_cases_are_named():
+    assert {*LONG, *LIKE} <= {case.name for case in CASES}
 
 
 @pytest.mark.parametrize('case', [marked(case) for case in CASES])

@@ -193,7 +193,7 @@ def test_the_fit_descends(scan, whole):
         fitted.volume()
 
 
-@pytest.mark.parametrize('stop', [14, 15, 33])
+@pytest.mark.parametrize('stop', [14, pytest.param(15, marks=pytest.mark.thorough), 33])
 def test_resumed_fit_is_the_same_fit(scan, whole, tmp_path, stop, variant):
     """Stopped before a reset of the opacities, right after it, and after the densification."""
     method, fitted = whole
