@@ -27,6 +27,7 @@ SHARE = (
     'projectors/test_joseph.py',
     'projectors/test_tilted_joseph.py',
     'plugins/test_integrator.py',
+    'plugins/test_sensors.py',
     'reconstruction/test_iterative.py',
     'fitting/test_fit.py',
     'fitting/test_loop.py',

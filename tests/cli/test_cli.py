@@ -68,12 +68,6 @@ def result(scene):
     return folder, json.loads((folder / 'metrics.json').read_text()), out
 
 
-@pytest.fixture(scope='module')
-def dataset(scene):
-    """The scan of the scene."""
-    return take_scan(load_scene(scene))
-
-
 def in_its_own_process(*arguments):
     """A whole fit, whose sums do not depend on what this process has done before."""
     process = fit_process(*arguments)

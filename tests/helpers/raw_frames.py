@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+import lingo_mi as lm
+
 
 @dataclass
 class Raw:
@@ -41,3 +43,22 @@ def raw_frames(n=6, shape=(24, 40), photons=20_000.0, noise=True, exposure=1.0) 
     flats, darks = take(photons * gain, 20), take(np.zeros(shape), 10)
     views = take(photons * gain * np.exp(-truth) * np.reshape(exposure, (-1, 1, 1)), n)
     return Raw(truth, views, flats, darks, bad, photons)
+
+
+def load(frames, geometry, **options):
+    return lm.load_raw(frames, geometry, progress=False, **options)
+
+
+def save(tmp_path, raw):
+    for name in ('views', 'flats', 'darks'):
+        np.save(tmp_path / f'{name}.npy', getattr(raw, name))
+    return dict(flats=tmp_path / 'flats.npy', darks=tmp_path / 'darks.npy')
+
+
+def check(scan, raw):
+    """Line integrals within five of their own standard deviations, the mask exactly the bad pixels."""
+    valid = np.ones(scan.projections.shape, bool) if scan.valid is None else scan.valid
+    np.testing.assert_array_equal(valid, np.broadcast_to(~raw.bad, valid.shape))
+    sigma = np.sqrt(np.exp(raw.truth) / raw.photons * (1 + 1 / 20) * 1.3)
+    assert (np.abs(scan.projections - raw.truth)[valid] < 5 * sigma[valid]).all()
+    assert abs((scan.projections - raw.truth)[valid].mean()) < 1e-3

@@ -3,6 +3,8 @@
 import mitsuba as mi
 import numpy as np
 
+from lingo_mi.geometry import CircularGeometry, Grid
+from lingo_mi.validation import oracle
 from lingo_mi.validation.oracle import random_cloud
 
 SCANNER = dict(
@@ -15,6 +17,9 @@ SCANNER = dict(
     nVoxel='8',
     dVoxel='.25',
     angles='33',
+)
+FILM = dict(
+    type='hdrfilm', width=26, height=19, rfilter=dict(type='box'), component_format='float32', pixel_format='luminance'
 )
 
 
@@ -88,3 +93,25 @@ def mitsuba_rays(sensor):
     at = mi.Point2f(((x + 0.5) / width).tolist(), ((y + 0.5) / height).tolist())
     ray, _ = sensor.sample_ray(0.0, 0.5, at, mi.Point2f(0.5))
     return (np.broadcast_to(np.array(x, float).T, (width * height, 3)) for x in (ray.o, ray.d))
+
+
+def pose(sensor, view=0):
+    g = scanner_geometry(sensor)
+    return oracle.Pose.of(g.rays(), view, *g.nDetector)
+
+
+def scanner_geometry(sensor=SCANNER):
+    def numbers(name):
+        return [float(x) for x in sensor[name].split(',')]
+
+    return CircularGeometry(
+        DSO=sensor['DSO'],
+        DSD=sensor['DSD'],
+        angles=np.radians(numbers('angles')),
+        **{name: numbers(name) for name in ('nDetector', 'dDetector', 'offDetector')},
+        grid=Grid(8, 0.25),
+    )
+
+
+def everything():
+    return dict(cloud=ellipsoids(cloud_of()), more=ellipsoids(cloud_of(3, 5)), grid=grid(values_of()), block=block())

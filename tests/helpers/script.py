@@ -9,10 +9,13 @@ from pathlib import Path
 from unittest import mock
 
 import mitsuba as mi
+import nibabel
+import numpy as np
 
 from lingo_mi.cli import run as run_command
 
 FIT = Path(__file__).parents[2] / 'scripts' / 'fit.py'
+RECONSTRUCT = FIT.with_name('reconstruct.py')
 
 # A foot on 24^3 voxels before a panel of 32 x 40 pixels.
 SCENE = """<scene version="3.0.0">
@@ -82,3 +85,18 @@ def fit_process(*args, **options):
         text=True,
         **options,
     )
+
+
+def changed_scene(folder, *pairs):
+    """The tiny scene with some of its lines replaced."""
+    text = SCENE
+    for old, new in pairs:
+        assert text.count(old) == 1
+        text = text.replace(old, new)
+    (folder / 'scene.xml').write_text(text)
+    return folder / 'scene.xml'
+
+
+def load(path):
+    """The voxels of a NIfTI file."""
+    return nibabel.load(path).get_fdata(dtype=np.float32)
