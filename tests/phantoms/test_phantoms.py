@@ -12,6 +12,7 @@ import pytest
 
 import lingo_mi as lm
 from helpers.phantoms import forget
+from helpers.short import short
 from lingo_mi import phantoms
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.ply import read_ply
@@ -21,9 +22,6 @@ from lingo_mi.phantoms import DENSEST, chest, foot, gaussians, mesh, shepp_logan
 from lingo_mi.phantoms import x3d_scan as scanning
 
 SIZES = 64, 128
-CHEST_THOROUGH = [
-    pytest.param(n, marks=pytest.mark.thorough) if n == 'chest' else n for n in phantoms.names()
-]  # which takes many seconds to make
 SCRIPT = Path(__file__).parents[2] / 'scripts' / 'phantom.py'
 
 
@@ -89,7 +87,7 @@ def test_form(made, name, size):
     assert p.spacing == (side / size,) * 3
 
 
-@pytest.mark.parametrize('name', CHEST_THOROUGH)
+@pytest.mark.parametrize('name', short({name: name for name in phantoms.names()}, ('foot', 'gaussians', 'shepp_logan')))
 def test_seed(name):
     data = phantoms.make(name, 16).data
     forget()
@@ -97,7 +95,9 @@ def test_seed(name):
     assert np.array_equal(phantoms.make(name, 16, seed=7).data, data) == (name in ('mesh', 'shepp_logan'))
 
 
-@pytest.mark.parametrize('name', CHEST_THOROUGH)
+@pytest.mark.parametrize(
+    'name', short({name: name for name in phantoms.names()}, ('foot', 'gaussians', 'mesh', 'shepp_logan'))
+)  # the chest takes many seconds to make
 def test_sizes_agree(made, name):
     fine, coarse = _halved(made(name, 128).data), made(name, 64).data
     assert abs(fine.mean() / coarse.mean() - 1) < 0.02
