@@ -152,12 +152,26 @@ class Scan:
         return len(self.geometry)
 
     def subset(self, index: Index) -> Scan:
-        """The views `index` only: a slice, or integers [m].
+        """The same scan with some of its views.
+
+        Parameters
+        ----------
+        index : slice or [m]
+            The views: a slice, or integers.
+
+        Returns
+        -------
+        Scan
+            With the same valid pixels and effects. Stored views are not read.
 
         Raises
         ------
         InputError
             For views that the scan does not have.
+
+        Examples
+        --------
+        >>> every_second = scan.subset(slice(0, None, 2))
         """
         index = checked_views(index, len(self))
         if self.stored is not None:
@@ -170,18 +184,52 @@ class Scan:
         )
 
     def views(self, index: Index) -> np.ndarray:
-        """The projections of some views, float32 [view, v, u]; of stored ones, these alone are read."""
+        """The projections of some views. If they are stored in a file, only these are read.
+
+        Parameters
+        ----------
+        index : slice or [m]
+            The views: a slice, or integers.
+
+        Returns
+        -------
+        ndarray
+            Float32 [m, v, u].
+        """
         return self.projections[index] if self.stored is None else self.stored[index]
 
     def pieces(self) -> Iterator[np.ndarray]:
-        """All projections, `PIECE` views after the other."""
+        """Iterate over all projections, `PIECE` views at a time.
+
+        Yields
+        ------
+        ndarray
+            Float32 [view, v, u]; the last may have fewer views.
+        """
         for first in range(0, len(self), PIECE):
             yield self.views(slice(first, first + PIECE))
 
     def binned(self, factor: int) -> Scan:
-        """The same views with `factor` x `factor` pixels averaged into one; rows and columns left over are dropped.
+        """The same views with `factor` x `factor` pixels averaged into one. Remaining rows and columns are dropped.
 
-        A side of fewer than two new pixels is not binned. A new pixel is not valid if one of its pixels is dead or not valid.
+        Parameters
+        ----------
+        factor : int
+            Pixels a side, at least 1. A side of fewer than two new pixels is not binned.
+
+        Returns
+        -------
+        Scan
+            A new pixel is not valid if one of its pixels is dead or not valid.
+
+        Raises
+        ------
+        InputError
+            For a factor below 1.
+
+        Examples
+        --------
+        >>> small = scan.binned(2)
         """
         geometry, by = self.geometry.binned(factor), self.geometry.bins(factor)
         rows, columns = geometry.nDetector
@@ -196,16 +244,36 @@ class Scan:
         return replace(self, geometry=geometry, projections=p, valid=valid, effects=effects)
 
     def on(self, grid: Grid) -> Scan:
-        """The same scan with other voxels."""
+        """The same scan with other voxels.
+
+        Parameters
+        ----------
+        grid : Grid
+            The new voxels, mm.
+
+        Returns
+        -------
+        Scan
+            With the same projections.
+
+        Examples
+        --------
+        >>> fine = scan.on(scan.geometry.grid.finer(2))
+        """
         if self.stored is not None:
             return Scan(self.geometry.on(grid), self.stored)  # type: ignore[arg-type] - read when needed
         return replace(self, geometry=self.geometry.on(grid))
 
     def to_flat(self) -> Scan:
-        """The scan on a flat panel, `CurvedGeometry.to_flat`, for what knows no curved ones; a scan with a flat panel as it is.
+        """Resample the scan on a flat panel, for methods that do not support curved ones.
 
         Line integrals are interpolated along rows and columns: by cubic splines, or linearly if some pixels are not valid. A
         pixel with such a neighbour is not valid.
+
+        Returns
+        -------
+        Scan
+            On the panel of `CurvedGeometry.to_flat`; a scan with a flat panel is returned unchanged.
 
         Raises
         ------
@@ -231,7 +299,13 @@ class Scan:
         return Scan(flat, out, valid)
 
     def digest(self) -> str:
-        """Tells scans apart, to know stored work again: 32 characters of voxels, rays, projections and valid pixels."""
+        """Return a digest of the scan, by which stored work is recognised.
+
+        Returns
+        -------
+        str
+            32 characters, from voxels, rays, projections and valid pixels.
+        """
         geometry, rays = self.geometry, self.geometry.rays(curved=True)
         numbers = geometry.grid.shape, geometry.grid.spacing, geometry.grid.centre, geometry.nDetector
         hasher = hashlib.blake2b(repr(numbers).encode(), digest_size=16)

@@ -217,20 +217,25 @@ def load_raw(
 
 
 def phantom(name: str, size: int = 256, seed: int = 0, *, attenuation: str = 'x3d') -> Phantom:
-    """A test object made by formula: 'foot', 'chest', 'shepp_logan', 'gaussians' or 'mesh', on size^3 voxels.
-
-    `phantom.data` is float32 [x, y, z], per mm, `phantom.spacing` the voxel size in mm.
+    """A test object made by formula.
 
     Parameters
     ----------
+    name : {'foot', 'chest', 'shepp_logan', 'gaussians', 'mesh'}
+        The object.
     size : int
         Voxels a side, 8 to 512.
     seed : int
         Seed of textures, vessels and random Gaussians.
-    attenuation : str
+    attenuation : {'x3d', 'real'}
         'x3d': densities from 0 to 1, as in the published tables of X3D and R2-Gaussian. No scanner measures line integrals as
         large as theirs. 'real': these densities times 0.0618 per mm, dense cortical bone at 60 keV. Soft tissue of the foot and
         the head is then lighter than water, because the factor is right for bone.
+
+    Returns
+    -------
+    Phantom
+        `data` is float32 [x, y, z], per mm, and `spacing` the voxel size in mm.
 
     Raises
     ------

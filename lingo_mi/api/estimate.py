@@ -40,6 +40,10 @@ class Estimate:
         Bytes that this process may take, on the GPU if one is used.
     seconds : tuple of float or None
         Least and most time. None without a trial.
+
+    Examples
+    --------
+    `lm.estimate(scan, 'fast').memory / 2**30`
     """
 
     memory: float

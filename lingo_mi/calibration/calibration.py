@@ -37,6 +37,14 @@ class Calibration:
         The air level that was read beside the object and taken out first; None if none was.
     notes : tuple[str, ...]
         Sentences on what the scan does not determine.
+
+    Examples
+    --------
+    ::
+
+        calibration = lm.calibrate(data)
+        print('\\n'.join(calibration.lines()))
+        fit = lm.fit(calibration.corrected(data))
     """
 
     geometry: Geometry
@@ -64,15 +72,29 @@ class Calibration:
     def corrected(self, scan: Dataset) -> Dataset: ...
 
     def corrected(self, scan: Scan | Dataset) -> Scan | Dataset:
-        """The same views with the measured position of the panel.
+        """Apply the calibration to a scan.
 
         Held-out views get the correction for their time, which follows from their angles: the views of the scan must be in the
         order in which they were taken. An air level that was read beside the object is read again in each view.
+
+        Parameters
+        ----------
+        scan : Scan or Dataset
+            The views of the calibrated scan, or of other views by the same scanner.
+
+        Returns
+        -------
+        Scan or Dataset
+            The same views with the measured position of the panel, and without the response that was found.
 
         Raises
         ------
         InputError
             For a scan by another scanner.
+
+        Examples
+        --------
+        `better = lm.calibrate(data).corrected(data)`
         """
         require_type('scan', scan, (Scan, Dataset))
         if isinstance(scan, Dataset):
@@ -94,7 +116,20 @@ class Calibration:
         return replace(scan, geometry=self.found.drift.panel(scan.geometry).moved(scan.geometry))
 
     def lines(self) -> list[str]:
-        """Describe the result in sentences."""
+        """Describe the result in sentences.
+
+        Returns
+        -------
+        list[str]
+            A line for each number with its standard error, how well views predict each other, and `notes`.
+
+        Examples
+        --------
+        ::
+
+            for line in lm.calibrate(scan).lines():
+                print(line)
+        """
         f, pixel = self.found, dict(zip('vu', self.geometry.dDetector))
         lines = []
         if self.air is not None:

@@ -38,6 +38,14 @@ class InputError(ValueError):
 
     It names Python's arguments, as in `force=True`. Commands print it in less than 300 characters, with their options instead
     (see `lingo_mi.cli.common.guard`), and exit with code 2.
+
+    Examples
+    --------
+    >>> try:
+    ...     raise InputError("angles: 3 angles for 4 views; give one for each view")
+    ... except InputError as error:
+    ...     print(error)
+    angles: 3 angles for 4 views; give one for each view
     """
 
     def __init__(self, message: object = ''):

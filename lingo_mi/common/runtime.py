@@ -154,12 +154,26 @@ _SHUTDOWN, _INIT, _WHOS = '_Z12jit_shutdowni', '_Z8jit_initj', '_Z12jit_var_whos
 
 
 def use_variant(name: str | None = None) -> str:
-    """Activate a Mitsuba variant and return its name: `name`, else cuda_ad_mono, else llvm_ad_mono.
+    """Activate a Mitsuba variant.
+
+    Parameters
+    ----------
+    name : str, optional
+        Name of the variant (default: cuda_ad_mono, or llvm_ad_mono if CUDA cannot run).
+
+    Returns
+    -------
+    str
+        Name of the active variant.
 
     Raises
     ------
     InputError
-        If none can run, saying what to install.
+        For an unknown name, and if no variant can run. The message says what to install.
+
+    Examples
+    --------
+    `lm.use_variant('llvm_ad_mono')`
     """
     import mitsuba as mi
 

@@ -62,7 +62,17 @@ class Fit(FittedModel):
 
     @classmethod
     def load(cls, path: str | PathLike) -> Fit:
-        """The fit in a folder that `lm.fit` or `save` wrote, by the folder or its result.xml; or of a checkpoint (.npz) alone.
+        """Load a fit from a folder or from a checkpoint.
+
+        Parameters
+        ----------
+        path : path-like
+            A folder that `lm.fit` or `save` wrote, its result.xml, or a checkpoint (.npz) alone.
+
+        Returns
+        -------
+        Fit
+            Without the scan's data; see `with_data`.
 
         Raises
         ------
@@ -100,7 +110,22 @@ class Fit(FittedModel):
         return fit
 
     def with_data(self, data: Dataset | None) -> Fit:
-        """The same fit beside other held-out views, or another true volume."""
+        """The same fit beside other held-out views, or another true volume.
+
+        Parameters
+        ----------
+        data : Dataset or None
+            The data to compare with.
+
+        Returns
+        -------
+        Fit
+            With the same model.
+
+        Examples
+        --------
+        `fit.with_data(data).view()`
+        """
         return Fit(self.checkpoint, self.model, data)
 
     # ---- numbers ----
@@ -120,15 +145,24 @@ class Fit(FittedModel):
         return self._stored if self.data is None and self._stored else self.numbers | description(self)
 
     def metrics(self, data: Dataset | None = None) -> dict[str, float | None]:
-        """PSNR and SSIM of held-out views and volume, IPSD, times; None without a truth to compare with.
+        """PSNR and SSIM of held-out views and volume, IPSD, times.
 
-        The full scale of `psnr_2d`, `ssim_2d`, `psnr_3d` and `ssim_3d` is the largest true value. Those that end in `_r2` are
-        R2-Gaussian's, as published tables have them: views divided by their own maxima, and 1 for densities.
+        The full scale of `psnr_2d`, `ssim_2d`, `psnr_3d` and `ssim_3d` is the largest true value. Names that end in `_r2`
+        follow R2-Gaussian's published tables: views are divided by their own maxima, and the full scale of densities is 1.
 
         Parameters
         ----------
         data : Dataset, optional
-            What to compare with (default: what `lm.fit` received; of a loaded fit, the numbers as saved).
+            The data to compare with (default: the data that `lm.fit` received; a loaded fit returns the saved numbers).
+
+        Returns
+        -------
+        dict[str, float or None]
+            Numbers by name, in dB, seconds or none of these; None without a truth to compare with.
+
+        Examples
+        --------
+        `fit.metrics()['psnr_3d']`
         """
         if data is not None:
             require_type('data', data, Dataset, 'write lm.Dataset(scan, test, volume)')
@@ -241,11 +275,36 @@ class Fit(FittedModel):
         return folder
 
     def write(self, folder: Path, title: str, note: dict | None = None, unit: Unit = PER_MM) -> None:
-        """`save` without the checkpoint, into an existing folder that this process has locked."""
+        """Write the files of `save` without the checkpoint, into an existing folder that this process has locked.
+
+        Parameters
+        ----------
+        folder : Path
+            The folder.
+        title : str
+            Title of the report.
+        note : dict, optional
+            Further entries of metrics.json.
+        unit : Unit
+            Unit of the values in volume.nii.gz.
+        """
         write_fit(folder, self, self.numbers | (note or {}), lambda numbers: self.report(title, numbers), unit)
 
     def report(self, title: str = '', numbers: dict | None = None) -> ReportData:
-        """The contents of the report. numbers: to show in the place of `numbers`."""
+        """Return the contents of the report.
+
+        Parameters
+        ----------
+        title : str
+            Title (default: the method's name).
+        numbers : dict, optional
+            Numbers to show in place of `numbers`.
+
+        Returns
+        -------
+        ReportData
+            Volume, views, cloud, history and numbers.
+        """
         test = None if self.data is None else self.data.test
         angles = np.array(self.view_angles)
         more: dict[str, Any] = {}
@@ -274,15 +333,22 @@ class Fit(FittedModel):
         )
 
     def view(self, *, title: str = '') -> Page:
-        """The interactive page of the fit: linked slices, held-out views, curves, the cloud in 3D, all numbers.
-
-        As the last line of a notebook's cell the `Page` shows itself there; elsewhere `page.open()` opens it in the browser, and
-        `page.save('foot.html')` writes it. It is the report.html of `save`, 1 to 30 MB.
+        """Make the interactive page of the fit: linked slices, held-out views, curves, the cloud in 3D, all numbers.
 
         Parameters
         ----------
         title : str
             Title of the page (default: the method's name).
+
+        Returns
+        -------
+        Page
+            The report.html of `save`, 1 to 30 MB. As the last line of a notebook's cell it shows itself there. Elsewhere
+            `page.open()` opens it in the browser, and `page.save('foot.html')` writes it.
+
+        Examples
+        --------
+        `fit.view().save('foot.html')`
         """
         return Page(report_page(self.report(title)))
 
@@ -309,7 +375,27 @@ class Fit(FittedModel):
 
 
 def load_fit(path: str | PathLike) -> Fit:
-    """A fit from the folder that `Fit.save` or the command line wrote, or from a checkpoint alone; see `Fit.load`."""
+    """Load a fit from a folder or from a checkpoint; see `Fit.load`.
+
+    Parameters
+    ----------
+    path : path-like
+        A folder that `Fit.save` or the command line wrote, or a checkpoint (.npz) alone.
+
+    Returns
+    -------
+    Fit
+        Without the scan's data.
+
+    Raises
+    ------
+    InputError
+        If there is no result, if it is damaged, or if files do not belong together.
+
+    Examples
+    --------
+    `fit = lm.load_fit('out/foot')`
+    """
     return Fit.load(path)
 
 

@@ -100,7 +100,17 @@ class Gaussians:
 
     @classmethod
     def from_gsplat(cls, means: Any, quats: Any, scales: Any, density: Any) -> Gaussians:
-        """Take arrays in the order of gsplat's `rasterization`, quaternions (w, x, y, z), of NumPy, PyTorch or JAX.
+        """Take arrays in the order of gsplat's `rasterization`, of NumPy, PyTorch or JAX.
+
+        Parameters
+        ----------
+        means, quats, scales, density
+            Centres in mm [N, 3], quaternions (w, x, y, z) [N, 4], standard deviations in mm [N, 3] and densities per mm [N].
+
+        Returns
+        -------
+        Gaussians
+            With quaternions (x, y, z, w).
 
         Examples
         --------
@@ -112,9 +122,14 @@ class Gaussians:
         return cls(means, scales, quats[..., _REAL_LAST], density)
 
     def to_gsplat(self) -> tuple[Any, Any, Any, Any]:
-        """The arrays in the order of gsplat's `rasterization`: means, quats (w, x, y, z), scales, density.
+        """Return the arrays in the order of gsplat's `rasterization`.
 
-        gsplat's fourth argument is an opacity in [0, 1], which a density is not: it renders surfaces, not line integrals.
+        gsplat's fourth argument is an opacity in [0, 1], and a density is not: gsplat renders surfaces, not line integrals.
+
+        Returns
+        -------
+        tuple
+            means [N, 3], quats (w, x, y, z) [N, 4], scales [N, 3], density [N].
 
         Examples
         --------

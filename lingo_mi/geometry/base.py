@@ -171,9 +171,21 @@ class Geometry(ABC):
     def parallel(
         cls, *, nDetector: ArrayLike, dDetector: ArrayLike, angles: ArrayLike, **placement: Unpack[Placement]
     ) -> Geometry:
-        """A parallel beam that turns about z. The parameters are the same as for `cone`, without the distances.
+        """A parallel beam that turns about z.
 
-        rotDetector does not turn its beam.
+        Parameters
+        ----------
+        nDetector, dDetector
+            Pixels and pixel size in mm, (v, u).
+        angles : [n]
+            Radians, n >= 1.
+        **placement
+            The voxels and the motions, as in `cone`. rotDetector does not turn the beam.
+
+        Returns
+        -------
+        Geometry
+            A `CircularGeometry` without rotDetector, COR, tilt and height.
 
         Raises
         ------
@@ -193,14 +205,21 @@ class Geometry(ABC):
 
     @classmethod
     def helix(cls, *, angles: ArrayLike, pitch: float, **scan: Unpack[ConeNumbers]) -> Geometry:
-        """A cone beam whose source and panel climb `pitch` mm a turn, at z = 0 for the angle 0.
+        """A cone beam whose source and panel climb along z, and are at z = 0 for the angle 0.
 
         Parameters
         ----------
         angles : [n]
             Radians, beyond 2 pi if there are several turns. Negative angles lie below z = 0.
+        pitch : float
+            Climb of a turn, mm. A negative pitch descends.
         **scan
             The other parameters of `cone`.
+
+        Returns
+        -------
+        Geometry
+            A scan with a pose for every view.
 
         Raises
         ------
@@ -229,11 +248,20 @@ class Geometry(ABC):
         Parameters
         ----------
         DSO, DSD : float or [n]
-            As in `cone`.
+            Distances from the source to the axis and to the panel, mm.
+        nDetector, dDetector
+            Pixels and pixel size in mm, (v, u), the same in all views.
+        mode : {'cone', 'parallel'}
+            Kind of beam.
         **views
             angles, [n] radians or [n, 3] Euler angles; offDetector, rotDetector, COR, height and tilt, once or for every view;
             the voxels as in `cone`. offOrigin may be [n, 3], which is TIGRE's way to move the object. The grid then stays at the
             mean, and the scanner moves by the differences from it, in the opposite direction.
+
+        Returns
+        -------
+        Geometry
+            A `CircularGeometry` if the views lie on a circle, else a scan with a pose for every view.
 
         Raises
         ------
@@ -288,14 +316,60 @@ class Geometry(ABC):
 
     @classmethod
     def from_tigre(cls, geo: Any, angles: ArrayLike) -> Geometry:
-        """The scan that a geometry of TIGRE for Python describes: see `lingo_mi.geometry.tigre.scan`."""
+        """The scan that a geometry of TIGRE for Python describes.
+
+        Parameters
+        ----------
+        geo : tigre.utilities.geometry.Geometry or dict
+            TIGRE's geometry, mm; see `lingo_mi.geometry.tigre.scan`.
+        angles : [n] or [n, 3]
+            TIGRE's angles, radians.
+
+        Returns
+        -------
+        Geometry
+            The same rays and voxels.
+
+        Raises
+        ------
+        InputError
+            If a number is missing, or for numbers that make no scan.
+
+        Examples
+        --------
+        `geometry = lm.Geometry.from_tigre(geo, np.linspace(0, 2 * np.pi, 50, endpoint=False))`
+        """
         from lingo_mi.geometry import tigre
 
         return tigre.scan(geo, angles)
 
     @classmethod
     def from_astra(cls, proj_geom: dict, vol_geom: dict | None = None, **voxels: Unpack[Voxels]) -> Geometry:
-        """The scan that geometries of the ASTRA toolbox describe: see `lingo_mi.geometry.astra.scan`."""
+        """The scan that geometries of the ASTRA toolbox describe.
+
+        Parameters
+        ----------
+        proj_geom : dict
+            Projection geometry, by `astra.create_proj_geom`; see `lingo_mi.geometry.astra.scan`.
+        vol_geom : dict, optional
+            Volume geometry, by `astra.create_vol_geom`.
+        **voxels
+            In place of vol_geom: grid, or nVoxel, dVoxel and offOrigin, as in `cone`.
+
+        Returns
+        -------
+        Geometry
+            The same rays and voxels.
+
+        Raises
+        ------
+        InputError
+            If a number is missing, or for numbers that make no scan.
+
+        Examples
+        --------
+        `geometry = lm.Geometry.from_astra(proj_geom, vol_geom)`
+        """
         from lingo_mi.geometry import astra
 
         return astra.scan(proj_geom, vol_geom, **voxels)
@@ -304,7 +378,31 @@ class Geometry(ABC):
     def from_rtk(
         cls, source: str | PathLike | Any, *, nDetector: ArrayLike, dDetector: ArrayLike, **voxels: Unpack[Voxels]
     ) -> Geometry:
-        """The scan that a geometry of RTK describes: see `lingo_mi.geometry.rtk.scan`."""
+        """The scan that a geometry of RTK describes.
+
+        Parameters
+        ----------
+        source : path-like or object
+            A file of RTK's, or an `itk.RTK.ThreeDCircularProjectionGeometry`; see `lingo_mi.geometry.rtk.scan`.
+        nDetector, dDetector
+            Pixels and pixel size in mm, (v, u), which RTK keeps with the projections.
+        **voxels
+            Either grid, or nVoxel, dVoxel and offOrigin, as in `cone`.
+
+        Returns
+        -------
+        Geometry
+            The same rays.
+
+        Raises
+        ------
+        InputError
+            If the file is missing or damaged, or for numbers that make no scan.
+
+        Examples
+        --------
+        `geometry = lm.Geometry.from_rtk('geometry.xml', nDetector=512, dDetector=0.8, nVoxel=256, dVoxel=1)`
+        """
         from lingo_mi.geometry import rtk
 
         return rtk.scan(source, nDetector=nDetector, dDetector=dDetector, **voxels)
@@ -327,21 +425,60 @@ class Geometry(ABC):
         ----------
         curved : bool
             Whether the caller supports curved panels, whose rays have a `Rays.curve`. If not, curved panels are refused.
+
+        Returns
+        -------
+        Rays
+            Sources, corners and steps of the panels, [view, 3] each.
+
+        Raises
+        ------
+        InputError
+            For a curved panel, unless `curved`.
         """
 
     @abstractmethod
     def subset(self, index: Index) -> Geometry:
-        """The same scan with the views `index` only: a slice, or integers [m]."""
+        """The same scan with some of its views.
+
+        Parameters
+        ----------
+        index : slice or [m]
+            The views: a slice, or integers.
+
+        Returns
+        -------
+        Geometry
+            Of the same kind.
+        """
 
     @abstractmethod
     def binned(self, factor: int) -> Geometry:
         """The same scan with `factor` x `factor` pixels joined into one. Remaining rows and columns are dropped.
 
-        A side of fewer than two new pixels is not binned: see `bins`.
+        Parameters
+        ----------
+        factor : int
+            Pixels a side, at least 1. A side of fewer than two new pixels is not binned: see `bins`.
+
+        Returns
+        -------
+        Geometry
+            Of the same kind.
         """
 
     def joined(self, other: Geometry) -> Geometry:
-        """The views of this scan, then the views of another with as many pixels, on this scan's grid.
+        """The views of this scan, then the views of another, on this scan's grid.
+
+        Parameters
+        ----------
+        other : Geometry
+            A scan with the same beam and as many pixels.
+
+        Returns
+        -------
+        Geometry
+            All views.
 
         Raises
         ------
@@ -359,6 +496,16 @@ class Geometry(ABC):
     def on(self, grid: Grid) -> Self:
         """The same scan with other voxels.
 
+        Parameters
+        ----------
+        grid : Grid
+            The new voxels, mm.
+
+        Returns
+        -------
+        Geometry
+            Of the same kind.
+
         Examples
         --------
         >>> scan = Geometry.parallel(nDetector=8, dDetector=1, grid=Grid(8, 1.0), angles=[0.0])
@@ -374,7 +521,18 @@ class Geometry(ABC):
         return nv * dv, nu * du
 
     def normalised_rays(self, curved: bool = False) -> Rays:
-        """The rays of all views in the normalised frame of the grid. curved: as for `rays`."""
+        """The rays of all views in the normalised frame of the grid, whose longest side is 2.
+
+        Parameters
+        ----------
+        curved : bool
+            As for `rays`.
+
+        Returns
+        -------
+        Rays
+            Sources, corners and steps of the panels, [view, 3] each.
+        """
         rays, centre, k = self.rays(curved), np.array(self.grid.centre), self.grid.scale
         source = rays.source if rays.parallel else (rays.source - centre) * k
         return replace(rays, source=source, corner=(rays.corner - centre) * k, u=rays.u * k, v=rays.v * k)
@@ -390,6 +548,11 @@ class Geometry(ABC):
         radius : float, optional
             Radius of the cylinder, mm (default: DSD). With DSD the cylinder's axis passes through the focal spot, as in clinical
             scanners, and the angle between neighbouring columns is dDetector[1] / DSD.
+
+        Returns
+        -------
+        CurvedGeometry
+            The curved scan.
 
         Raises
         ------
@@ -417,6 +580,11 @@ class Geometry(ABC):
         ----------
         shift : [3] or [view, 3]
             Shift of the source, mm: along the rows (u), against the columns (up, for an upright panel), and away from the panel.
+
+        Returns
+        -------
+        Geometry
+            The scan with the shifted sources.
 
         Raises
         ------
@@ -469,10 +637,15 @@ class Geometry(ABC):
         return figure(self, chosen)
 
     def voxel_matrices(self) -> np.ndarray:
-        """Projection matrices [view, 3, 4] from voxel indices (i, j, k, 1) to (x w, y w, w), float64.
+        """Projection matrices from voxel indices to pixel positions.
 
-        x, y are continuous pixel positions as in `Rays`; w is the distance from the source along the panel's
-        normal over its value at the axis (parallel: 1). Positions are those on the flat panel that a curved one touches.
+        They take (i, j, k, 1) to (x w, y w, w). x, y are continuous pixel positions as in `Rays`, on the flat panel that a
+        curved one touches. w is the distance from the source along the panel's normal over its value at the axis (parallel: 1).
+
+        Returns
+        -------
+        ndarray
+            Float64 [view, 3, 4].
         """
         out, grid = camera_matrices(self.rays(curved=True)), self.grid
         if self.mode == 'cone':
@@ -483,8 +656,23 @@ class Geometry(ABC):
         return out
 
     def bins(self, factor: int) -> tuple[int, int]:
-        """Return the numbers of rows and of columns that make a row and a column of `binned(factor)`: `factor`, or 1 along a
-        side of fewer than two new pixels."""
+        """Return the numbers of rows and of columns that `binned` joins.
+
+        Parameters
+        ----------
+        factor : int
+            The factor of `binned`, at least 1.
+
+        Returns
+        -------
+        tuple[int, int]
+            (v, u): `factor`, or 1 along a side of fewer than two new pixels.
+
+        Raises
+        ------
+        InputError
+            For a factor below 1.
+        """
         factor = whole_number('the binning of pixels', factor, 1)
         by_v, by_u = (factor if n >= 2 * factor else 1 for n in self.nDetector)
         return by_v, by_u

@@ -85,15 +85,57 @@ class Grid:
         return np.array(self.size) * self.scale / 2
 
     def finer(self, factor: int) -> Grid:
-        """The same box with every voxel divided into `factor` parts along each side."""
+        """The same box with every voxel divided into parts.
+
+        Parameters
+        ----------
+        factor : int
+            Parts along each side, at least 1.
+
+        Returns
+        -------
+        Grid
+            With `factor` times as many voxels along each side.
+
+        Examples
+        --------
+        >>> Grid(4, 1.0).finer(2).spacing
+        (0.5, 0.5, 0.5)
+        """
         return replace(self, shape=[factor * n for n in self.shape], spacing=[d / factor for d in self.spacing])
 
     def resized(self, shape: ArrayLike) -> Grid:
-        """The same box in `shape` voxels, (x, y, z)."""
+        """The same box in another number of voxels.
+
+        Parameters
+        ----------
+        shape : [3]
+            Voxels along x, y, z.
+
+        Returns
+        -------
+        Grid
+            With voxels of another size.
+
+        Examples
+        --------
+        >>> Grid(4, 1.0).resized((8, 4, 2)).spacing
+        (0.5, 1.0, 2.0)
+        """
         return replace(self, shape=shape, spacing=np.array(self.size) / np.asarray(shape))
 
     def slab(self, begin: int, end: int) -> Grid:
-        """The slices begin <= z < end alone, where they lie.
+        """The slices begin <= z < end alone, at their place.
+
+        Parameters
+        ----------
+        begin, end : int
+            Slices along z.
+
+        Returns
+        -------
+        Grid
+            The slab.
 
         Raises
         ------
@@ -112,12 +154,27 @@ class Grid:
         return replace(self, shape=(nx, ny, end - begin), centre=(x, y, middle))
 
     def slabs(self, thickness: int) -> list[tuple[int, int]]:
-        """(begin, end) of slabs of `thickness` slices along z, from the first; the last may be thinner.
+        """Divide the slices along z into slabs.
+
+        Parameters
+        ----------
+        thickness : int
+            Slices of a slab, at least 1.
+
+        Returns
+        -------
+        list[tuple[int, int]]
+            (begin, end) of each slab, from the first. The last may be thinner.
 
         Raises
         ------
         InputError
-            Unless a slab has a slice.
+            For a thickness below 1.
+
+        Examples
+        --------
+        >>> Grid(5, 1.0).slabs(2)
+        [(0, 2), (2, 4), (4, 5)]
         """
         thickness = whole_number('the thickness of a slab, in slices,', thickness, 1)
         return [(z, min(z + thickness, self.shape[2])) for z in range(0, self.shape[2], thickness)]

@@ -16,12 +16,29 @@ if TYPE_CHECKING:
 
 
 def circular(n: int, total: float = 360.0, start: float = 0.0) -> np.ndarray:
-    """n angles, [n] radians, evenly spaced over [start, start + total) degrees: `circular(4)` is 0, pi / 2, pi, 3 pi / 2.
+    """Evenly spaced angles on a circle.
+
+    Parameters
+    ----------
+    n : int
+        Number of views, from 1 to `limits.MOST_VIEWS`.
+    total, start : float
+        The angles divide [start, start + total), in degrees. A negative total turns the other way.
+
+    Returns
+    -------
+    ndarray
+        [n] radians.
 
     Raises
     ------
     InputError
-        Unless n is from 1 to `limits.MOST_VIEWS`, and for angles of too many turns.
+        For a number of views out of range, and for angles of too many turns.
+
+    Examples
+    --------
+    >>> (circular(4) / np.pi).tolist()
+    [0.0, 0.5, 1.0, 1.5]
     """
     count = limits.numbers('the number of views', n)
     if count.ndim or not count >= 1 or np.isfinite(count) and count % 1:

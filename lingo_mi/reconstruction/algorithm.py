@@ -66,25 +66,34 @@ class Reconstruction:
         return np.array(self.volume, dtype) if copy else np.asarray(self.volume, dtype)
 
     def metrics(self, truth: ArrayLike) -> dict[str, float | None]:
-        """PSNR in dB and SSIM of the volume: psnr_3d and ssim_3d, whose full scale is the largest true density, and psnr_3d_r2
-        and ssim_3d_r2, R2-Gaussian's, whose full scale is 1; None if a value is not finite.
+        """PSNR in dB and SSIM of the volume.
 
         Parameters
         ----------
         truth : array_like
             The true densities per mm, [x, y, z], on the same voxels.
 
+        Returns
+        -------
+        dict[str, float or None]
+            `psnr_3d` and `ssim_3d`, whose full scale is the largest true density, and R2-Gaussian's `psnr_3d_r2` and
+            `ssim_3d_r2`, with the full scale 1; None if a value is not finite.
+
         Raises
         ------
         InputError
             For a truth of another shape, or that is not finite.
+
+        Examples
+        --------
+        `lm.reconstruct(scan, lm.FDK()).metrics(data.volume)['psnr_3d']`
         """
         return compared(self.volume, as_numpy(truth, 'the true volume'))
 
     def save(
         self, path: str | PathLike, *, units: str = '1/mm', mu_water: float | None = None, force: bool = False
     ) -> Path:
-        """Write the volume with voxel size and position in mm; returns the path.
+        """Write the volume with voxel size and position in mm.
 
         Parameters
         ----------
@@ -97,6 +106,11 @@ class Reconstruction:
         force : bool
             Replace an earlier file.
 
+        Returns
+        -------
+        Path
+            The path of the file.
+
         Raises
         ------
         InputError
@@ -104,7 +118,7 @@ class Reconstruction:
 
         Examples
         --------
-        >>> found.save('foot.dicom', units='hu', mu_water=0.0206)
+        >>> result.save('foot.dicom', units='hu', mu_water=0.0206)
         """
         path, unit = as_path('path', path), unit_of(units, mu_water)
         with writing(path):

@@ -42,6 +42,10 @@ class Field(Part):
         Samples on a ray (NAF: 192 for 128^3 voxels, 320 for 256^3).
     field_rays : int
         Rays of a view in a step (NAF: 1024).
+
+    Examples
+    --------
+    `lm.NAF(field=lm.Field(field_levels=12))`
     """
 
     RANGES: ClassVar = dict(

@@ -47,6 +47,10 @@ class DensityMethod(CloudMethod):
     effects : {'model', 'ignore'}
         Whether the fit models the effects that the scene declares (spectrum, focal spot, blur, dead pixels), or takes all
         projections for line integrals.
+
+    Examples
+    --------
+    `lm.fit(scan, lm.DensityMethod(start=lm.EdgeStart(), densify=lm.Halve()))`
     """
 
     CHOICES: ClassVar = CloudMethod.CHOICES | dict(effects=('model', 'ignore'))

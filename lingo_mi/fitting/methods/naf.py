@@ -45,6 +45,10 @@ class NAF(Method):
     References
     ----------
     Zha, Zhang and Li, "NAF: Neural Attenuation Fields for Sparse-View CBCT Reconstruction", MICCAI 2022.
+
+    Examples
+    --------
+    `lm.fit(scan, lm.NAF(iterations=20_000)).volume()`
     """
 
     name: ClassVar = 'naf'

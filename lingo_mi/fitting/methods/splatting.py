@@ -49,6 +49,10 @@ class GaussianSplatting(CloudMethod):
     References
     ----------
     Kerbl, Kopanas, Leimkuehler and Drettakis, "3D Gaussian Splatting for Real-Time Radiance Field Rendering", ACM TOG 42, 2023.
+
+    Examples
+    --------
+    `lm.fit(scan, lm.GaussianSplatting(sh_degree=0))`
     """
 
     RANGES: ClassVar = CloudMethod.RANGES | dict(sh_degree=(0, 3), sh_every=(1, MOST_STEPS))
@@ -104,6 +108,10 @@ class XGaussian(GaussianSplatting):
     ----------
     Cai, Liang, Wang, Wang, Zhang, Yang, Zhou and Yuille, "Radiative Gaussian Splatting for Efficient X-ray Novel View Synthesis",
     ECCV 2024.
+
+    Examples
+    --------
+    `lm.fit(scan, lm.XGaussian())`
     """
 
     name: ClassVar = 'xgaussian'

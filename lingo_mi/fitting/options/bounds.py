@@ -10,7 +10,22 @@ from lingo_mi.fitting.options.part import Part, require
 
 @dataclass(frozen=True)
 class ScaleBounds(Part):
-    """Bounds of standard deviations, in the normalised frame (R2-Gaussian: 5e-4 and 0.5 of the longest side, which is 2)."""
+    """Bounds of standard deviations, in the normalised frame (R2-Gaussian: 5e-4 and 0.5 of the longest side, which is 2).
+
+    Parameters
+    ----------
+    scale_min, scale_max : float
+        Least and largest standard deviation; scale_min < scale_max.
+
+    Raises
+    ------
+    InputError
+        For bounds out of order or out of range.
+
+    Examples
+    --------
+    `lm.Fast().changed(scale_min=2e-3)`
+    """
 
     RANGES: ClassVar = dict.fromkeys(('scale_min', 'scale_max'), (1e-9, 1e3))
 

@@ -29,6 +29,10 @@ class Corrections(Part):
         Gain of the views, likewise.
     fit_pixels : {'off', 'one'}
         'one' fits what each pixel adds to its line integrals in all views: gains that the flat fields missed.
+
+    Examples
+    --------
+    `lm.fit(scan, lm.Fast().changed(rate_pose=(1e-3, 1e-4), pose_motion='smooth'))`
     """
 
     RANGES: ClassVar = dict(rate_pose=(0, 1))

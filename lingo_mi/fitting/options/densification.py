@@ -64,6 +64,10 @@ class Clone(Densify):
     ----------
     split_size : float
         Gaussians with a larger standard deviation are split (R2-Gaussian: 0.1 of the longest side, which is 2).
+
+    Examples
+    --------
+    `lm.R2().changed(densify_threshold=1e-4)`
     """
 
     RANGES: ClassVar = Densify.RANGES | dict(split_size=_SIZES)
@@ -74,7 +78,12 @@ class Clone(Densify):
 
 @dataclass(frozen=True)
 class Halve(Densify):
-    """Gaussians are cut in two along their longest axis, which keeps mass and covariance."""
+    """Gaussians are cut in two along their longest axis, which keeps mass and covariance.
+
+    Examples
+    --------
+    `lm.R2(densify=lm.Halve())`
+    """
 
     name: ClassVar = 'halve'
 
@@ -93,6 +102,10 @@ class CloneOpacities(Clone):
         Iterations between resets of the opacities to 0.01, during densification; 0: never.
     prune_size : float
         Gaussians with a larger standard deviation are removed after the first reset.
+
+    Examples
+    --------
+    `lm.GaussianSplatting().changed(reset_every=0)`
     """
 
     RANGES: ClassVar = Clone.RANGES | dict(reset_every=_STEPS, prune_size=_SIZES)

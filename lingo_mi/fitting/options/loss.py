@@ -26,6 +26,10 @@ class ImageLoss(Part):
     weights : {'equal', 'noise'}
         'noise' divides rendered and measured pixels by the standard deviation of their noise, which follows from the scan's
         `ct_detector`.
+
+    Examples
+    --------
+    `lm.GaussianSplatting(loss=lm.ImageLoss(lambda_ssim=0))`
     """
 
     RANGES: ClassVar = dict.fromkeys(('lambda_l1', 'lambda_ssim', 'lambda_gradient'), WEIGHT)
@@ -70,6 +74,10 @@ class Loss(ImageLoss):
     loss_scale : {'none', 'dynamic', 'statistic'}
         'dynamic': LINGO's factor T_g + 1 / (4 T_g) on the whole loss. 'statistic': the same factor on the densification
         statistic alone, since Adam cancels a constant factor of the loss.
+
+    Examples
+    --------
+    `lm.R2(loss=lm.Loss(lambda_tv=0.1))`
     """
 
     RANGES: ClassVar = ImageLoss.RANGES | dict(

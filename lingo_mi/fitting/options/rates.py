@@ -44,7 +44,23 @@ class Rates(Part):
 
 @dataclass(frozen=True)
 class DensityRates(Rates):
-    """Rates of Gaussians with densities; lengths are in the normalised frame. Defaults are R2-Gaussian's."""
+    """Rates of Gaussians with densities; lengths are in the normalised frame. Defaults are R2-Gaussian's.
+
+    Parameters
+    ----------
+    decay_steps, beta1, beta2, nesterov, epsilon, average
+        See `Rates`.
+    rate_centre, rate_scale : tuple of float
+        Step sizes (first, last) for the centres and the standard deviations.
+    rate_density : tuple of float
+        Step sizes for the densities.
+    rate_rotation : tuple of float
+        Step sizes for the quaternions.
+
+    Examples
+    --------
+    `lm.Fast().changed(rate_centre=(1e-3, 1e-4))`
+    """
 
     RANGES: ClassVar = Rates.RANGES | dict.fromkeys(
         ('rate_centre', 'rate_density', 'rate_scale', 'rate_rotation'), RATES
@@ -61,6 +77,21 @@ class OpacityRates(Rates):
     """Rates of Gaussians with opacities and radiances; `rate_centre` is in units of the scene's radius (see `models.alpha`).
 
     Defaults are 3DGS's.
+
+    Parameters
+    ----------
+    decay_steps, beta1, beta2, nesterov, epsilon, average
+        See `Rates`.
+    rate_centre, rate_scale, rate_rotation : tuple of float
+        Step sizes (first, last) for the centres, the standard deviations and the quaternions.
+    rate_opacity : tuple of float
+        Step sizes for the opacities.
+    rate_radiance, rate_harmonics : tuple of float
+        Step sizes for the mean radiance and for its spherical harmonics.
+
+    Examples
+    --------
+    `lm.GaussianSplatting().changed(rate_opacity=(2e-2, 2e-2))`
     """
 
     RANGES: ClassVar = Rates.RANGES | dict.fromkeys(
@@ -77,7 +108,19 @@ class OpacityRates(Rates):
 
 @dataclass(frozen=True)
 class FieldRates(Rates):
-    """Rates of a neural field. NAF's are 0.001, later 0.0001."""
+    """Rates of a neural field. NAF's are 0.001, later 0.0001.
+
+    Parameters
+    ----------
+    decay_steps, beta1, beta2, nesterov, epsilon, average
+        See `Rates`.
+    rate_features, rate_network : tuple of float
+        Step sizes (first, last) for the features of the hash grid and for the weights of the network.
+
+    Examples
+    --------
+    `lm.NAF().changed(rate_network=(5e-4, 5e-5))`
+    """
 
     RANGES: ClassVar = Rates.RANGES | dict.fromkeys(('rate_features', 'rate_network'), RATES)
 

@@ -21,6 +21,10 @@ class Stopping(Part):
         Iterations between two predictions of the held-out views.
     stop_patience : int
         Iterations without a better prediction after which the first fit ends, at least `stop_every`.
+
+    Examples
+    --------
+    `lm.fit(scan, lm.Fast().changed(stop='on'))`
     """
 
     RANGES: ClassVar = dict(stop_every=(1, MOST_STEPS), stop_patience=(1, MOST_STEPS))

@@ -45,6 +45,10 @@ class EdgeStart(NumberedStart):
     within : {'masks', 'volume'}
         Where points may lie: in LINGO's masks, or anywhere in the volume. Masks that would cut off more than a tenth of the
         volume's edges are not used, and the fit's `info` says so.
+
+    Examples
+    --------
+    `lm.R2(start=lm.EdgeStart(within='volume'))`
     """
 
     CHOICES: ClassVar = dict(within=('masks', 'volume'))

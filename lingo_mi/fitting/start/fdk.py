@@ -31,6 +31,10 @@ class FDKStart(NumberedStart):
         Only voxels above it are drawn, in the fit's unit of density (R2-Gaussian: 0.05).
     fdk_rescale : float
         Density of a Gaussian over the density of its voxel (R2-Gaussian: 0.15).
+
+    Examples
+    --------
+    `lm.LINGO(start=lm.FDKStart())`
     """
 
     RANGES: ClassVar = NumberedStart.RANGES | dict(fdk_threshold=(-1e6, 1e6), fdk_rescale=(0, 1e6))

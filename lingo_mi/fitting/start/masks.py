@@ -58,6 +58,10 @@ class MaskStart(NumberedStart):
         that fits the projections best.
         'fdk' takes an FDK volume at the point in place of the mean pixel, times a factor as 'lsq' does; a scan that FDK cannot
         reconstruct has 'lsq' instead.
+
+    Examples
+    --------
+    `lm.R2(start=lm.MaskStart(n_points=20_000))`
     """
 
     RANGES: ClassVar = NumberedStart.RANGES | dict(

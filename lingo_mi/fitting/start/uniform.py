@@ -22,6 +22,15 @@ class RandomStart(NumberedStart):
     """Points drawn uniformly from the volume. 3DGS without a point cloud draws 100,000 from a cube around the scene.
 
     Of a fan beam, all points lie in the plane z = 0.
+
+    Parameters
+    ----------
+    n_points : int
+        Points of the cloud.
+
+    Examples
+    --------
+    `lm.GaussianSplatting(start=lm.RandomStart())`
     """
 
     name: ClassVar = 'random'
@@ -42,6 +51,10 @@ class CuboidStart(Start):
     ----------
     cuboid_step : int
         Voxels between points (X-Gaussian: 8). More than four million points are refused.
+
+    Examples
+    --------
+    `lm.XGaussian(start=lm.CuboidStart(cuboid_step=4))`
     """
 
     RANGES: ClassVar = dict(cuboid_step=(1, 1e6))
