@@ -66,8 +66,8 @@ class Scan:
         Bool [view, v, u], where pixels must be left out (dead ones, metal, a collimator's shadow); None: all are valid. What the
         projections hold in the others, NaN included, is forgotten: they become 0.
     effects : PixelEffects or None
-        What a detector saw besides line integrals (`effects.forward.Effects`); None: nothing. The projections are then -ln of its
-        signal, and densities attenuation at the tube's reference energy.
+        Effects of a detector besides line integrals (`effects.forward.Effects`); None: nothing. The projections are then -ln of
+        its signal, and densities attenuation at the tube's reference energy.
 
     Raises
     ------

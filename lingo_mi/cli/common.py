@@ -330,7 +330,7 @@ def runner_of(args: argparse.Namespace, folder: Path) -> Iterator[Any]:
     Parameters
     ----------
     folder : Path
-        That all workers must see; it exists.
+        An existing folder that all workers must see.
 
     Raises
     ------

@@ -52,7 +52,7 @@ def read_list(path: PathLike | str, method: str = 'fast') -> list[Row]:
     Parameters
     ----------
     method : str
-        Of rows that name none.
+        Method of the rows that do not name one.
     """
     path = Path(path)
     header, records = _records(path)

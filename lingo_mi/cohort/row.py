@@ -32,27 +32,27 @@ class Row:
     Parameters
     ----------
     name : str
-        Of the folder of its result.
+        Name of the folder of its result.
     line : int
-        Of the list.
+        Line in the list.
     folder : str
-        Of the list, which relative paths begin from.
+        Folder of the list, from which relative paths begin.
     file : str
         Projections; with a scene for the geometry, a CT volume for its scanner, or '' for its own objects.
     geometry : str
         '', a geometry file, or a scene: its file, or the name of a shipped one.
     method : str
-        Of the fit: `name` or `name:option=value,...`.
+        Method of the fit: `name` or `name:option=value,...`.
     views : int or None
         Evenly spaced ones to fit; None: all.
     seed : int
-        Of every random choice.
+        Seed of every random choice.
     mu_water : float or None
-        Of a CT volume in Hounsfield units, in 1/mm.
+        Attenuation of water for a CT volume in Hounsfield units, 1/mm.
     settings : dict[str, str]
         Options that differ from the method's, as text.
     parameters : dict[str, str]
-        Of the scene, as text.
+        Parameters of the scene, as text.
     """
 
     name: str

@@ -20,7 +20,7 @@ def as_numpy(values: Any, name: str, dtype: DTypeLike | None = None) -> np.ndarr
         Numbers, nested lists of them, or an array of any library that has `__array__` or `__dlpack__`: NumPy, PyTorch, Dr.Jit,
         JAX, ...
     name : str
-        What they are, for messages.
+        Name of the values, for messages.
     dtype : DTypeLike or None
         Type of the result; default: their own.
 

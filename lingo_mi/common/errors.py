@@ -64,7 +64,7 @@ def require_type(name: str, value: object, kinds: type | tuple[type, ...], remed
     name : str
         Name of the argument, for the message.
     remedy : str
-        What to do, for the message.
+        Remedy, for the message.
 
     Examples
     --------

@@ -32,7 +32,7 @@ class GPU:
     multiprocessors : int
         Their number.
     warps : int
-        That one of them holds at once, at most.
+        Most warps that one of them holds at once.
     capability : int
         Compute capability times ten: 86, 90.
     clock : float

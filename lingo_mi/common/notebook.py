@@ -37,7 +37,7 @@ def frames(
     start : int or None
         The image that is seen first (default: the one in the middle).
     window : tuple[float, float] or None
-        What is black and what is white (default: as `window_of` says).
+        Values of black and of white (default: as `window_of` says).
 
     Examples
     --------

@@ -68,7 +68,7 @@ class Progress:
         Parameters
         ----------
         fields
-            What to show beside the bar, by name: numbers (`loss`, `psnr_2d`, `gaussians`, ...), text, or functions without
+            Values to show beside the bar, by name: numbers (`loss`, `psnr_2d`, `gaussians`, ...), text, or functions without
             arguments that give one. A function is called only when its value is drawn, so that reading a number back from the
             device does not slow the loop. None is not shown.
         """

@@ -30,7 +30,7 @@ class TubeParameters:
     Parameters
     ----------
     materials : dict[str, str]
-        Those of single shapes, by name: the parameters material_NAME.
+        Materials of single shapes, by name: the parameters material_NAME.
     """
 
     energy: float | None = None

@@ -196,9 +196,9 @@ def read_volume(
     mu_water : float or None
         Attenuation of water, 1/mm: Hounsfield units become density in 1/mm instead of [0, 1].
     shape : Sequence[int] or None
-        Of raw bytes, (x, y, z), x fastest.
+        Shape of raw bytes, (x, y, z), x fastest.
     dtype
-        Of raw bytes, a NumPy type such as 'uint8' or '>u2'; neither is needed for the well-known 256^3 `foot`.
+        NumPy type of raw bytes, such as 'uint8' or '>u2'; neither is needed for the well-known 256^3 `foot`.
     spacing : array_like or None
         Voxel size in mm, one number or (x, y, z), for formats without it (default: 1 mm, with a warning); TIFF has it where
         ImageJ or OME wrote it.
@@ -296,7 +296,7 @@ def write_volume(path: PathLike | str, data: np.ndarray, grid: Grid, description
     grid : Grid
         Its voxels.
     description : str
-        What the values are, for example 'normalised' or '1/mm'; about 65 bytes fit.
+        Name of the values, for example 'normalised' or '1/mm'; about 65 bytes fit.
 
     Raises
     ------

@@ -64,13 +64,13 @@ class Checkpoint:
     history : list of dict
         Measurements over time.
     info : dict
-        What the start has measured.
+        Measurements of the start.
     scan : dict
-        What tells the scan from others; see `resume.identity`.
+        Numbers that tell the scan from others; see `resume.identity`.
     effects : bool
         Whether the fit models effects of the scan, which a checkpoint does not hold.
     search : dict or None
-        What the search for the step to stop at has seen; see `stopping`.
+        Record of the search for the last step; see `stopping`.
     seen : int
         Views that the steps see: all, but for a search.
     """

@@ -32,7 +32,7 @@ class ExpectedSignal:
     effects
         With lengths in the fit's frame.
     bands
-        Of the spectrum; None if materials do not matter.
+        Bands of the spectrum; None if materials do not matter.
     split
         Densities between which the second material's share rises, 1/mm; None for one material.
     scattered

@@ -193,7 +193,7 @@ class Fit(FittedModel):
         grid : Grid, optional
             Grid of the voxels (default: the scan's); `scan.geometry.grid.finer(2)` has smaller ones.
         units, mu_water
-            Of the values in the file: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm.
+            Unit of the values in the file: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm.
         slab : int
             Slices that are in memory at once.
         cluster : str or Client, optional
@@ -204,7 +204,7 @@ class Fit(FittedModel):
         Returns
         -------
         Path
-            Of the file.
+            The path of the file.
 
         Raises
         ------
@@ -242,11 +242,11 @@ class Fit(FittedModel):
         Parameters
         ----------
         folder : path
-            Is made if it is missing.
+            The folder; it is made if it is missing.
         title : str
             Title of the report (default: the folder's name).
         units, mu_water
-            Of the values in volume.nii.gz: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm.
+            Unit of the values in volume.nii.gz: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm.
         force : bool
             Replace an earlier result; other files in the folder are left alone.
         note : dict, optional
@@ -255,7 +255,7 @@ class Fit(FittedModel):
         Returns
         -------
         Path
-            Of the folder.
+            The path of the folder.
 
         Raises
         ------

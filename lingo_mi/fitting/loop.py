@@ -162,7 +162,7 @@ class Running:
     average : Average
         Average of the states.
     rng : Generator
-        Of the views' order, the total variation's cubes and splits.
+        Generator of the views' order, the total variation's cubes and the splits.
     order : list of int
         Views that are next.
     iteration : int

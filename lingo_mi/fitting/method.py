@@ -94,7 +94,7 @@ class Method(Part, ABC):
         unit : float
             The density that the fit counts as 1, in 1/mm.
         effects : Effects or None
-            Those of the scan that the fit models.
+            The effects of the scan that the fit models.
         """
 
     def poses(self, geometry: Geometry) -> Poses | None:

@@ -39,7 +39,7 @@ class GaussianStepper(Stepper):
     targets : list of MeasuredView
         The measured views on the device.
     corrections : sequence of Correction
-        What is fitted besides the cloud.
+        Corrections that are fitted with the cloud.
     share : Float or None
         Share of the second of two materials in every Gaussian.
     """

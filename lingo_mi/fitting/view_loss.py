@@ -109,7 +109,7 @@ def differentiate(
     signal
         `ExpectedSignal` of the detector; None: line integrals.
     share
-        Of the second of two materials in every Gaussian, Float [N]; None: one material.
+        Share of the second of two materials in every Gaussian, Float [N]; None: one material.
 
     Returns
     -------

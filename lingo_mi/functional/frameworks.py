@@ -28,9 +28,9 @@ class Argument:
     name : str
         For messages.
     array
-        Of any kind.
+        An array of any kind.
     shape : tuple[int or None, ...]
-        That it must have; None for a size that the first argument with a None decides.
+        Shape that it must have; None for a size that the first argument with a None decides.
     double : bool
         Whether it is computed on in float64, not in float32.
     """

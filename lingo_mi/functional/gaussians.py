@@ -89,7 +89,7 @@ class Gaussians:
         path : path-like
             The file; an existing one is replaced.
         grid : Grid
-            As of `from_r2`.
+            As for `from_r2`.
 
         Raises
         ------

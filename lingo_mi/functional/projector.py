@@ -215,7 +215,7 @@ class Backprojector(LinearMap):
     Attributes
     ----------
     T : Projector
-        Whose transpose this is.
+        The operator whose transpose this is.
     """
 
     def __init__(self, projector: Projector):

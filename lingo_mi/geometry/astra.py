@@ -57,10 +57,10 @@ def scan(proj_geom: dict, vol_geom: dict | None = None, **voxels: Unpack[Voxels]
     Parameters
     ----------
     proj_geom : dict
-        Of the type 'cone', 'cone_vec', 'cyl_cone_vec', 'parallel3d' or 'parallel3d_vec', or in two dimensions 'fanflat',
+        Geometry of the type 'cone', 'cone_vec', 'cyl_cone_vec', 'parallel3d' or 'parallel3d_vec', or in two dimensions 'fanflat',
         'fanflat_vec', 'parallel' or 'parallel_vec'; lengths as they are.
     vol_geom : dict
-        Of `astra.create_vol_geom`. In two dimensions, its slice is as thick as a pixel is wide.
+        Geometry by `astra.create_vol_geom`. In two dimensions, its slice is as thick as a pixel is wide.
     **voxels
         Instead of vol_geom: either grid, or nVoxel, dVoxel and offOrigin, as for `Geometry.cone`.
 

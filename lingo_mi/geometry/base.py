@@ -449,7 +449,7 @@ class Geometry(ABC):
         Returns
         -------
         Geometry
-            Of the same kind.
+            A geometry of the same kind.
         """
 
     @abstractmethod
@@ -464,7 +464,7 @@ class Geometry(ABC):
         Returns
         -------
         Geometry
-            Of the same kind.
+            A geometry of the same kind.
         """
 
     def joined(self, other: Geometry) -> Geometry:
@@ -504,7 +504,7 @@ class Geometry(ABC):
         Returns
         -------
         Geometry
-            Of the same kind.
+            A geometry of the same kind.
 
         Examples
         --------

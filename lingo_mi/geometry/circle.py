@@ -25,7 +25,7 @@ class CircularGeometry(Geometry):
     offDetector : [2]
         Shift of the panel, (v, u), mm, positive v up.
     **numbers
-        Those of `Geometry`. DSO and DSD of a parallel beam only place its panel.
+        The numbers of `Geometry`. DSO and DSD of a parallel beam only place its panel.
 
     Raises
     ------

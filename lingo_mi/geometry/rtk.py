@@ -72,7 +72,7 @@ def scan(
     Parameters
     ----------
     source : path or itk.RTK.ThreeDCircularProjectionGeometry
-        Of RTK's XML file, or its object.
+        RTK's XML file, or its object.
     nDetector, dDetector
         Pixels and pixel size in mm, (v, u).
     **voxels

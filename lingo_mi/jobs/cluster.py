@@ -40,11 +40,11 @@ def opened(
         'tcp://HOST:PORT' of a scheduler, its file FILE.json, or 'local:N', N processes of this machine; or a client of
         `distributed`, which stays open.
     folder : Path
-        That all workers must see; it exists.
+        An existing folder that all workers must see.
     threads : int
-        Of Dr.Jit a worker, on the CPU (0: all that a worker has; of local:N, its share).
+        Dr.Jit's threads on a worker's CPU (0: all that a worker has; of local:N, its share).
     variant : str or None
-        Of Mitsuba on the workers; None: each chooses.
+        Variant of Mitsuba on the workers; None: each chooses.
     bar : bool
         Show how far the jobs are.
 

@@ -19,12 +19,12 @@ class Job:
     name : str
         Name of the job, another one for each.
     steps : int
-        That it reports, for the progress.
+        Steps that it reports, for the progress.
     function : callable
-        Of a module, called as function(*arguments, report=report). It calls report(steps done, **fields) between its steps, where
-        KeyboardInterrupt says that it must stop; what it has stored by then it finds again.
+        A function of a module, called as function(*arguments, report=report). It calls report(steps done, **fields) between its
+        steps, where KeyboardInterrupt says that it must stop; what it has stored by then it finds again.
     arguments : tuple
-        That pickle.
+        Arguments that pickle.
     """
 
     name: str

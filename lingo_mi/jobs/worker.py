@@ -32,7 +32,7 @@ def require_fit(worker: dict, folder: str, variant: str | None) -> None:
     Parameters
     ----------
     variant : str or None
-        Of Mitsuba, that it must have; None: it chooses.
+        Variant of Mitsuba that it must have; None: it chooses.
     """
     who = f'worker {worker["address"]}'
     if worker['version'] != (ours := version('lingo_mi')):
@@ -59,9 +59,9 @@ def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str
     topic : str
         Topic of the events that it sends.
     folder : str
-        That all workers share.
+        A folder that all workers share.
     threads : int
-        Of Dr.Jit on the CPU; 0: as many as it has.
+        Dr.Jit's threads on the CPU; 0: as many as it has.
     """
     from distributed import get_worker
 

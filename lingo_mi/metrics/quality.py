@@ -232,7 +232,7 @@ def _each(function, items, size):
     Parameters
     ----------
     size
-        Of an item, values.
+        Values of an item.
     """
     threads = max(1, min(cores(), THREADS, 3 * SLAB // size))
     with ThreadPoolExecutor(threads) as pool:

@@ -23,7 +23,7 @@ class FitWidget(widgets.Container):
     Parameters
     ----------
     napari_viewer : napari.Viewer
-        To which the volume is added, as a layer that is updated.
+        The viewer that gets the volume as a layer, which is updated.
     """
 
     def __init__(self, napari_viewer: Any):

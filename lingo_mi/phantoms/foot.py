@@ -90,7 +90,7 @@ def _long(a: ArrayLike, b: ArrayLike, radii: tuple[float, float, float], thick=1
     Parameters
     ----------
     radii : tuple[float, float, float]
-        Of base, shaft and head, mm.
+        Radii of base, shaft and head, mm.
     bow
         Rise at mid-shaft, mm.
     flare

@@ -358,9 +358,9 @@ def branches(
     Parameters
     ----------
     start, direction : array_like
-        Of the first branch, [3]; the direction of any length.
+        Start and direction of the first branch, [3]; the direction may have any length.
     length, radius : float
-        Of it.
+        Length and radius of the first branch.
     depth : int
         Generations of branches after it.
     """

@@ -170,7 +170,7 @@ class Share:
     lane : UInt32
         Lane numbers; a team has consecutive ones.
     begin, end : tuple
-        Of the team's share, as (item, block), UInt32.
+        Ends of the team's share, as (item, block), UInt32.
     blocks : UInt32 [N]
         Blocks of each item.
     layout : Layout
@@ -260,7 +260,7 @@ class Target:
     size : Int32
         Packets of an image.
     team : UInt32
-        Of a team's own image, which needs no atomics; None: the images are common.
+        Team with an image of its own, which needs no atomics; None: the images are common.
     parts : int
         Common images, each of a part of the items.
     """

@@ -106,7 +106,7 @@ def project(gaussians: Sequence, view: View, extent: float, widen: float = 0.0, 
     widen : float
         Variance, in pixels^2, of a round Gaussian to convolve footprints with (|d|^2 taken as constant).
     cut : Cuts or None
-        To backpropagate in parts, by its `pass_on`.
+        Cuts at which `pass_on` backpropagates in parts.
     """
     centre, scale, rotation, density = gaussians
     cut = cut or Cuts(False)

@@ -351,7 +351,7 @@ def project_volume(
     Parameters
     ----------
     volume : ndarray [x, y, z]
-        Of shape `geometry.grid.shape`; densities per mm.
+        Densities per mm, of the shape `geometry.grid.shape`.
     progress : callable or None
         Called as progress(views done, views) after every view.
 

@@ -154,7 +154,7 @@ class _Packed:
     triangles : Int32 [4 T]
         Vertices sorted by y, and the parity of that order.
     height, width : Int32
-        Of the image.
+        Size of the image.
     packets : Int32
         Packets per image row.
     bend : Float

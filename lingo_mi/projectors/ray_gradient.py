@@ -41,7 +41,7 @@ def moving(volume: Any, geometry: Geometry, kind: type[Gathered | GridPair], vie
     volume : Float [nx * ny * nz]
         z fastest.
     geometry : Geometry
-        Whose grid it is.
+        The geometry with the grid.
     kind : type[Gathered or GridPair]
         The projector whose model to differentiate.
     """

@@ -108,7 +108,7 @@ class _Packed:
     Parameters
     ----------
     numbers : Float [12 N]
-        Those of `Footprints` with the ridge in place of the centre's x.
+        The numbers of `Footprints` with the ridge in place of the centre's x.
     places : Int32 [4 N]
         Column of the ridge, row of the centre, first row and end of the rows.
     extent2 : Float

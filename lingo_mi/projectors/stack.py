@@ -223,7 +223,7 @@ def sampled(data: Any, inside: Any, first: Any, position: Any, counts: Any, stri
     position, counts
         Along both axes: in voxels, and how many there are.
     strides
-        From voxel to voxel, mi.UInt.
+        Strides from voxel to voxel, mi.UInt.
     """
     y, z = (dr.clip(p, 0, n - 1) for p, n in zip(position, counts))
     j, k = dr.floor(y), dr.floor(z)

@@ -74,7 +74,7 @@ def require_unfrozen(what: str) -> None:
     Parameters
     ----------
     what : str
-        That is called, for the message.
+        Name of the called function, for the message.
     """
     if dr.flag(dr.JitFlag.FreezingScope):
         raise InputError(

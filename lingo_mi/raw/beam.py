@@ -20,7 +20,7 @@ class Beam:
     Parameters
     ----------
     panel : Fields
-        Of the whole frame.
+        Fields of the whole frame.
     i0 : float or None
         Counts of the beam, if they are given, as an option or as Nikon's white level.
     air : tuple[int, int, int, int] or None

@@ -34,11 +34,11 @@ def import_raw(
     Parameters
     ----------
     path : path-like
-        What `lingo_mi.raw.frames.open_recording` opens.
+        A path that `lingo_mi.raw.frames.open_recording` opens.
     geometry : path-like or Geometry or None
-        Of the whole frames: a Geometry, a .yml of `lingo_mi.files.scans`, a scanner's own file (`frame_geometry.SCANNER_FILES`),
-        or RTK's .xml; None: what the frames' own file says. In a .yml nDetector may be left out, and nVoxel and dVoxel: the
-        voxels are then as large as a pixel on the axis.
+        Geometry of the whole frames: a Geometry, a .yml of `lingo_mi.files.scans`, a scanner's own file
+        (`frame_geometry.SCANNER_FILES`), or RTK's .xml; None: what the frames' own file says. In a .yml nDetector may be left
+        out, and nVoxel and dVoxel: the voxels are then as large as a pixel on the axis.
 
     Raises
     ------

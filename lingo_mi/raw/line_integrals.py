@@ -136,7 +136,7 @@ def counts_to_line_integrals(
     bins : tuple[int, int]
         (v, u) pixels that become one: their counts are added, bad ones left out, before the logarithm.
     exposure : float
-        Of this view over the exposure of the flats; without flats its air level in counts.
+        Exposure of this view over the exposure of the flats; without flats its air level in counts.
     saturation : float
         Counts from here on are not valid.
     outliers : bool
@@ -167,7 +167,7 @@ def bright_outliers(counts: np.ndarray, full: np.ndarray, good: np.ndarray) -> n
     Parameters
     ----------
     counts, full : ndarray
-        Of the view and of the unattenuated beam, without the dark ones, [v, u].
+        Counts of the view and of the unattenuated beam, without dark counts, [v, u].
     good : ndarray
         Bool, likewise: pixels that are looked at.
     """

@@ -75,7 +75,8 @@ class Taken:
     Parameters
     ----------
     scanner : dict or Geometry
-        By the names of `lingo_mi.files.scanner_dict`, without voxels: mm, degrees; or a Geometry, whose voxels do not count.
+        Numbers by the names of `lingo_mi.files.scanner_dict`, without voxels, mm and degrees; or a Geometry, whose voxels do
+        not count.
     columns, rows : int
         -1 if columns or rows run the other way than in `scanner`, else 1.
     white : float or None

@@ -346,7 +346,7 @@ class FilteredViews:
     Parameters
     ----------
     geometry : CircularGeometry
-        Of the views and the whole volume.
+        Geometry of the views and the whole volume.
     at : ndarray, Path or tuple[FDK, Scan]
         Float32 [view, u, v]; the .npy that holds them; or what they are made of when they are needed.
     """

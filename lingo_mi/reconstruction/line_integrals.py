@@ -86,7 +86,7 @@ def corrected(scan: Scan, effects: Effects, objects: Sequence, extent: float = c
     Parameters
     ----------
     effects : Effects
-        Whose noise is left out, so that simulated views are expected ones.
+        Effects without their noise, so that simulated views are expected ones.
     objects : Sequence
         Similar to the scanned ones, as from `projectors.objects.find_objects`; Gaussians end at `extent` deviations.
     """

@@ -40,7 +40,7 @@ def run_algorithm(
     Parameters
     ----------
     scan : Scan
-        Whose projections are line integrals: take a detector's effects out before (`line_integrals.line_integrals`).
+        A scan whose projections are line integrals: take a detector's effects out before (`line_integrals.line_integrals`).
     algorithm : Algorithm
         With its options.
     start : array, optional
@@ -121,7 +121,7 @@ def check_room(
     Parameters
     ----------
     algorithm : Algorithm or None
-        To check for (None: the least that any algorithm needs).
+        Algorithm to check for (None: the least that any algorithm needs).
     views : int or None
         Number of views to reconstruct from (None: the geometry's own).
     beside : float

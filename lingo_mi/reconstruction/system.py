@@ -38,7 +38,7 @@ class System:
     b
         The projections, `measured` or as corrected by `correct`.
     weights
-        Of the voxels [x, y, z], for `sart.sweep`; `weighed`: their line integrals. None: no weights.
+        Weights of the voxels [x, y, z], for `sart.sweep`; `weighed`: their line integrals. None: no weights.
     blur
         For `sart.sweep`.
     between

@@ -87,13 +87,13 @@ def slice_payload(
     Parameters
     ----------
     spacing
-        Of the grid's voxels, and `centre` of the grid, mm.
+        Spacing of the grid's voxels; `centre` is the grid's, mm.
     reference : str or None
         The volume that the others are compared with.
     of : tuple or None
         The grid's shape, and n, if the volumes are means of n^3 of its voxels already.
     quantity : str
-        What they hold, with its unit.
+        Their quantity, with its unit.
     """
 
     def candidates():
@@ -132,7 +132,7 @@ def error_maps(maps: dict[str, np.ndarray], slices: dict, arrays: Arrays) -> dic
     Parameters
     ----------
     slices : dict
-        Of these volumes, as `slices` gives it.
+        Slices of these volumes, as `slices` gives them.
     """
     for i, values in enumerate(maps.values()):
         small = block_means(np.asarray(values, np.float32), slices['preview'])
@@ -195,7 +195,7 @@ def _add(name: str, candidates: Iterable[tuple[Any, dict[str, np.ndarray]]], arr
     Returns
     -------
     tuple
-        That candidate.
+        The candidate.
     """
     for candidate in candidates:
         packed = candidate[1]

@@ -31,7 +31,7 @@ def page(
     numbers, command : str
         Markup of those sections, made by `table` and `code`.
     content : dict
-        What the scripts know (JSON); arrays: by name.
+        Data for the scripts (JSON); arrays: by name.
     live : bool
         Whether it asks the server that sent it for news.
     """

@@ -69,7 +69,7 @@ class _Reader:
     values : dict[str, str]
         Values of the scene parameters.
     folders : list[Path]
-        In which names are looked for.
+        Folders in which names are looked for.
     scenes : set[Path]
         The files themselves.
     texts : set[str]

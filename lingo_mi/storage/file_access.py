@@ -286,7 +286,7 @@ def require_writable(folder: Path, path: Path, remedy: str = 'choose another pla
     Parameters
     ----------
     remedy : str
-        What to do, for the message.
+        Remedy, for the message.
     """
     try:
         with tempfile.TemporaryFile(dir=_deepest(folder)):  # of a name that no file has

@@ -115,7 +115,7 @@ def complete_result(folder: Path, names: Iterable[str], numbers: dict, default: 
     Parameters
     ----------
     default : Callable or None
-        As of `json.dumps`.
+        As for `json.dumps`.
 
     Returns
     -------

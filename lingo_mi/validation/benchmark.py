@@ -220,7 +220,7 @@ def run_limit(program: Path, count: int, half: float) -> list[float]:
     Parameters
     ----------
     count : int
-        Of Gaussians.
+        Number of Gaussians.
     half : float
         Side of their boxes, halved, in pixels.
     """

@@ -47,7 +47,7 @@ class Row:
     parameter : str
         Its name.
     ad, fd : float
-        By automatic differentiation; by differences.
+        Derivatives by automatic differentiation and by differences.
     error : float
         |ad - fd| over the length of the gradient that it is a component of: all of one kind's components of a Gaussian, or all
         voxels that were drawn.

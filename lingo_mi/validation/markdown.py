@@ -34,7 +34,7 @@ def insert(text: str, tables: dict[str, str], where: str | Path = 'the document'
     tables : dict[str, str]
         Markdown by name.
     where : str or Path
-        What the text is, for the error.
+        Name of the text, for the error.
 
     Raises
     ------

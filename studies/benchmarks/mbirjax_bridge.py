@@ -56,7 +56,7 @@ def reconstruct(scan: Scan, mbirjax: Any, **settings: Any) -> np.ndarray:
     Parameters
     ----------
     settings
-        Of its model, such as sharpness=1.0.
+        Settings of its model, such as sharpness=1.0.
     """
     require_every_pixel(scan, 'MBIRJAX')
     ct_model = model(scan.geometry, mbirjax)

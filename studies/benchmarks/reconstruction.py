@@ -49,7 +49,7 @@ def measure(size: int, views: int, repeats: int, tilt: float = 0.0, say: Callabl
     repeats : int
         Rounds; the first one, which compiles, comes on top.
     tilt : float
-        Of the axis of rotation against the volume's, about x, degrees.
+        Tilt of the axis of rotation against the volume's, about x, degrees.
     say : callable
         Called with a line for each package that is not installed.
     """

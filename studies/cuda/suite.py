@@ -95,13 +95,13 @@ def run_tests(
     tests : Path
         The folder of tests of a checkout.
     names : Iterable[str]
-        Of files in it; they run from the checkout's root.
+        Names of files in it; they run from the checkout's root.
     sm : int
         Compute capability times ten.
     noise : bool
         Approximate instructions err by as much as NVIDIA allows, and every address is checked.
     cells : CellFiles
-        What is done, a file each; a file that it holds is run again only where it had failed, or was of other code.
+        Finished test files, a cell each; a file is run again only if it failed or belongs to other code.
     report : callable
         Called with a line for every file.
     """

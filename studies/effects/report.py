@@ -25,7 +25,7 @@ def write(results: dict[str, dict], folder: Path, figures: Path, document: Path 
     Parameters
     ----------
     results : dict[str, dict]
-        What `experiments.measure` gave, by the experiments' names; effects.json keeps what it holds of others, each with its own
+        Results of `experiments.measure`, by the experiments' names; effects.json keeps what it holds of others, each with its own
         `provenance`.
     document : Path or None
         A Markdown file with a place for the table `worth`; None: no document.

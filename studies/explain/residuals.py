@@ -62,7 +62,7 @@ class Explained:
     Parameters
     ----------
     rms : float
-        Of line integrals as measured.
+        Root mean square error of measured line integrals.
     view : ndarray
         A held-out view's difference, float32 [v, u].
     """

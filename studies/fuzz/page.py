@@ -16,7 +16,7 @@ def page(tallies: dict[str, Tally], seed: int, wall: float, seconds: float, memo
     wall : float
         Seconds that all cases took.
     seconds : float
-        That a case may take.
+        Seconds that a case may take.
     memory : int
         Bytes that a child may take.
     """

@@ -104,11 +104,11 @@ def run(
     Parameters
     ----------
     seconds : float
-        That a case may take.
+        Seconds that a case may take.
     memory : int
         Bytes of address space that a child may take for its cases.
     report : callable
-        Is told how many cases are done.
+        It is called with the number of finished cases.
     """
     tallies = {name: Tally() for name in names}
     work: queue.SimpleQueue = queue.SimpleQueue()

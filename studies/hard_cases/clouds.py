@@ -36,9 +36,9 @@ def scanner(
     angle : float
         In degrees.
     size : tuple[float, float]
-        Of the panel, (v, u).
+        Size of the panel, (v, u).
     changes
-        To the `Geometry`.
+        Changes of the `Geometry`.
     """
     pixel = [s / n for s, n in zip(size, shape)]
     settings = dict(DSO=5.0, DSD=7.5, nDetector=shape, dDetector=pixel, grid=Grid(8, 0.25), angles=np.radians([angle]))

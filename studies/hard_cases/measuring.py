@@ -63,7 +63,7 @@ class Result:
     warned : str
         The first warning.
     failed : str
-        What was wrong with the result, apart from its errors.
+        Faults of the result, apart from its errors.
     """
 
     image: float | None = None

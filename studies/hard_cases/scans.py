@@ -52,7 +52,7 @@ def fit_to(scan: Scan, iterations: int, **changes: Any) -> Fit:
     Parameters
     ----------
     changes
-        To its options.
+        Changes of its options.
 
     Raises
     ------

@@ -30,9 +30,9 @@ class Stored:
     variant : str
         Mitsuba's, that they were measured with.
     results : dict[str, Result]
-        By the case's name.
+        Results by the case's name.
     notes : dict[str, str]
-        Of the cases, by name.
+        Notes on the cases, by name.
     """
 
     variant: str

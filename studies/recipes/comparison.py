@@ -53,7 +53,7 @@ class Comparison:
     Parameters
     ----------
     folder : Path
-        Of their folders.
+        The folder of their folders.
     views : int
         Fitted.
     iterations : int

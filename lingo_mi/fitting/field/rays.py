@@ -49,9 +49,9 @@ def integrals(
     Parameters
     ----------
     density : callable
-        Of points in the cube: three Float [N] in [0, 1].
+        Density at points in the cube: three Float [N] in [0, 1].
     row
-        Of the view: one of `projectors.grid.view_table`, evaluated Float [19].
+        Row of the view: one of `projectors.grid.view_table`, evaluated Float [19].
     x, y
         Pixel positions of the rays, Float [rays], centres at i + 1/2.
     samples : int

@@ -43,7 +43,7 @@ class CloudMethod(Method):
     start : Start
         Start of the Gaussians.
     loss : ImageLoss
-        What is compared with the measured views.
+        Comparison with the measured views.
     densify : Densify
         When Gaussians are added and removed, and how.
     bounds : ScaleBounds

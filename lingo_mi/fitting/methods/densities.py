@@ -41,7 +41,7 @@ class DensityMethod(CloudMethod):
     start, densify, bounds, normalise, extent
         See `CloudMethod`.
     loss : Loss
-        What is compared with the measured views, and the total variation of the volume.
+        Comparison with the measured views, and total variation of the volume.
     corrections : Corrections
         Errors of the measurement that are fitted together with the cloud.
     effects : {'model', 'ignore'}

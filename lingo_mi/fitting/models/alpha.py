@@ -34,7 +34,7 @@ class AlphaCompositing(ForwardModel):
     Parameters
     ----------
     sh_degree, sh_every : int
-        As of `GaussianSplatting`.
+        As for `GaussianSplatting`.
     """
 
     sh_degree: int

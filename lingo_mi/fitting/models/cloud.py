@@ -61,7 +61,7 @@ class CloudModel(Model):
         image : callable
             Called with a function that renders along the rays of a view, the view, and its number.
         share
-            Of the second material in every Gaussian, or None.
+            Share of the second material in every Gaussian, or None.
         """
         g, (height, width) = self.geometry, geometry.nDetector
         # In the frame of the fit's own volume, whatever the voxels of this geometry.

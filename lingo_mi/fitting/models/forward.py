@@ -51,7 +51,7 @@ class ForwardModel(ABC):
         Parameters
         ----------
         density : ndarray or None
-            At the centres, in the fit's unit, [n]; None if the initial cloud has no densities.
+            Values at the centres, in the fit's unit, [n]; None if the initial cloud has no densities.
         """
 
     @abstractmethod
@@ -92,7 +92,7 @@ class ForwardModel(ABC):
         Parameters
         ----------
         cut : Cuts or None
-            To backpropagate in parts, by its `pass_on`, if the model can.
+            Cuts at which `pass_on` backpropagates in parts, if the model can.
         """
 
     @abstractmethod
@@ -102,7 +102,7 @@ class ForwardModel(ABC):
         Parameters
         ----------
         share
-            Of the second of two materials in every Gaussian, Float [N]; None: one material.
+            Share of the second of two materials in every Gaussian, Float [N]; None: one material.
         """
 
     def hold_back(self, gradients: dict, iteration: int) -> None:  # noqa: B027 - most models hold nothing back

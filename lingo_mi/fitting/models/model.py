@@ -29,7 +29,7 @@ class Model(ABC):
     effects : Effects or None
         Effects of the scan, if the fit models them; None: projections are line integrals.
     response : Response or None
-        What else the detector makes of line integrals, if that is fitted.
+        Response of the detector to line integrals, if it is fitted.
     """
 
     effects: Effects | None = None

@@ -27,9 +27,9 @@ class Part:
     Attributes
     ----------
     RANGES : dict
-        By field: the least and the largest number.
+        The least and the largest number, by field.
     CHOICES : dict
-        By field: the texts that are allowed.
+        The allowed texts, by field.
     name : str
         Name of a kind of this part, for command lines and files; '' if the part comes in one kind.
 

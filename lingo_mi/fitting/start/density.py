@@ -25,7 +25,7 @@ def fitted_factor(scan: Scan, render: Render, points: np.ndarray, density: np.nd
     Parameters
     ----------
     points, density, spacing : ndarray
-        Of the cloud, [N, 3], [N] and [N].
+        Arrays of the cloud, [N, 3], [N] and [N].
     """
     n = len(scan.geometry)
     views = np.unique(np.arange(min(n, VIEWS)) * n // min(n, VIEWS))

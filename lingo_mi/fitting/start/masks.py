@@ -51,7 +51,7 @@ class MaskStart(NumberedStart):
     misses : int
         Views that may miss a valid cell (paper: 0).
     outside : {'invalid', 'ignore', 'auto'}
-        What a cell counts that projects outside a view's image; see `voxel_filter.valid_voxels`. 'invalid' is the paper's,
+        How to count a cell that projects outside a view's image; see `voxel_filter.valid_voxels`. 'invalid' is the paper's,
         'ignore' serves truncated scans, 'auto' is 'ignore' if the object reaches the edge of the panel in some view.
     density : {'lsq', 'paper', 'r2', 'fdk'}
         The factor on the mean pixel: 'paper' takes 1, 'r2' the 0.15 that R2-Gaussian puts on FDK densities, and 'lsq' the factor

@@ -30,7 +30,7 @@ class StartingCloud:
     spacing : ndarray
         Standard deviations, float64 [N].
     info : dict
-        What the start has measured: numbers and texts.
+        Measurements of the start: numbers and texts.
     """
 
     points: np.ndarray
@@ -63,7 +63,7 @@ class Start(Part, ABC):
         scan : Scan
             Line integrals.
         rng : Generator
-            Of all random choices.
+            Generator of all random choices.
         render : callable
             Renders a cloud of isotropic Gaussians; see `Render`.
         unit : float

@@ -98,7 +98,7 @@ class DirectionalTV(TV):
     Parameters
     ----------
     direction : sequence of float
-        From source to panel in the middle view of the arc: x, y and z of a vector of any length.
+        Direction from source to panel in the middle view of the arc: x, y and z of a vector of any length.
     weight : float
         Weight along the direction, above 0. A weight of 1 is `TV`.
     inner : int
