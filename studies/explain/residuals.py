@@ -62,7 +62,7 @@ class Explained:
     Parameters
     ----------
     rms : float
-        Root mean square error of measured line integrals.
+        Root mean square of the difference, in line integrals.
     view : ndarray
         A held-out view's difference, float32 [v, u].
     """
