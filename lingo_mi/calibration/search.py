@@ -101,7 +101,8 @@ class _Level:
         return r if scan.valid is None else np.where(scan.valid, r, 0)
 
     def derivatives(self, here: dict[str, float]) -> np.ndarray:
-        """Of the differences, by central differences, of half a pixel for what moves: [number, view, v, u]."""
+        """Return the derivatives of the differences, [number, view, v, u], by central differences; motions have steps of half a
+        pixel."""
         derivatives = []
         for name in self.names:
             h = self.steps[name]

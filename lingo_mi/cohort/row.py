@@ -69,7 +69,7 @@ class Row:
 
     @property
     def path(self) -> Path | None:
-        """Of the file."""
+        """Path of the file."""
         return Path(self.folder) / self.file if self.file else None
 
     @property
@@ -152,7 +152,7 @@ def _digest(files):
 
 @lru_cache(maxsize=1024)
 def _digest_of(files):
-    """Of the contents of (file, size, time of change): a file that has not changed is read once."""
+    """Return a digest of the contents of (file, size, time of change). A file that has not changed is read once."""
     hasher = hashlib.sha256()
     for file, *_ in files:
         hasher.update(file.name.encode(errors='surrogateescape'))

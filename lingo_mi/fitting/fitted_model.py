@@ -178,7 +178,7 @@ class FittedModel:
 
     @property
     def view_angles(self) -> list[float]:
-        """Of the held-out views, degrees."""
+        """Angles of the held-out views, degrees."""
         if self.data is not None:
             return [] if self.data.test is None else np.degrees(self.data.test.geometry.angles).tolist()
         return (self._stored or {}).get('test_angles') or []

@@ -29,7 +29,7 @@ def outline_jitter(p: np.ndarray, angles: np.ndarray) -> tuple[float, float]:
 
 
 def _jitter(profiles):
-    """Of profiles [view, pixel] through the object, with air at both ends."""
+    """Return the unsteadiness of profiles [view, pixel] through the object, with air at both ends."""
     level = LEVEL * profiles.max()
     inside = profiles > level
     if inside[:, [0, -1]].any() or not inside.any(1).all():

@@ -93,7 +93,7 @@ class Bend:
 
     @staticmethod
     def of(curve: Curve, columns: int) -> Bend:
-        """Of a curve of one view and a panel of so many columns."""
+        """Make the bend for a curve of one view and a panel of so many columns."""
         table = column_table(curve, columns)
         largest = (1 / curve.share([0.0, columns])).max()
         return Bend(uploaded(table, double=True), uploaded(np.append(curve.numbers, largest), double=True))

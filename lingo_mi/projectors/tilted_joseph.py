@@ -154,7 +154,7 @@ class Ray:
         return cls(_affine(_affine(o, o_u, x), o_v, y), _affine(_affine(d, d_u, x), d_v, y), voxel)
 
     def weight(self, point, size):
-        """Of the voxel with the indices `point`, but for the path."""
+        """Return the weight of the voxel with the indices `point`, without the path."""
         m, *indices = self.axes.of(point)
         _, *counts = self.axes.of([mi.Float(n) for n in size])
         first, second = (hat(dr.fma(b, m, a), i, n) for (a, b), i, n in zip(self.lines, indices, counts))

@@ -67,7 +67,7 @@ class Live:
 
     @property
     def address(self) -> str:
-        """Of the page, with its token."""
+        """Address of the page, with its token."""
         return f'http://127.0.0.1:{self._port}/?token={self._token}'
 
     def announce(self) -> None:

@@ -176,8 +176,8 @@ def diffct(scan: Scan, volume: np.ndarray, cores: int) -> Operations | None:
 
 
 def compare(packages: dict[str, Operations], repeats: int) -> dict:
-    """By operation and package, medians over the repeats: seconds and, of packages other than 'ours', ratio (their time over
-    ours: above 1 they are slower) and deviation (relative RMS difference from our result)."""
+    """Return medians over the repeats by operation and package: seconds and, for packages other than 'ours', ratio (their time
+    over ours: above 1 they are slower) and deviation (relative RMS difference from our result)."""
     seconds, deviation, reference = {}, {}, np.empty(0)
     for turn in range(repeats + 1):
         for operation in packages['ours']:

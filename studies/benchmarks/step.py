@@ -89,7 +89,7 @@ def measured(fit: Fit, repeats: int) -> dict[str, float]:
 
 
 def _parts_of_the_loss(loss: Loss) -> list[str]:
-    """Those of LOSS that it has and can do without: something else must compare with the projections."""
+    """Return the parts of LOSS that the method has and can do without: another part must compare with the projections."""
     compared = loss.lambda_l1 + loss.lambda_ssim + loss.lambda_gradient
     weights = {part: getattr(loss, name) for part, name in LOSS.items()}
     return [part for part, weight in weights.items() if weight > 0 and (weight < compared or LOSS[part] == 'lambda_tv')]

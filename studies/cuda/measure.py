@@ -44,7 +44,7 @@ def kernels(work: Callable[[], object]) -> dict:
 
 
 def measured(fit: Fit, repeats: int) -> dict[str, dict]:
-    """Of an image with its derivatives, and of a step: `kernels`; of a step also `seconds`, of one of many in a row."""
+    """Measure an image with its derivatives and a step: `kernels`; for a step also `seconds`, each in a row of many."""
     view = VIEW % len(fit.nominal_geometry)
     geometry, rng = fit.nominal_geometry.subset([view]), np.random.default_rng(0)
     scan = Scan(geometry, rng.uniform(1, 2, (1, *geometry.nDetector)).astype(np.float32))

@@ -229,7 +229,7 @@ def test_scattered_light_is_not_negative():
 
 @pytest.mark.thorough
 def test_a_slope_of_scattered_light_alone_is_not_taken():
-    """Its mean is not told, so it is taken for 0; half of what is left would be negative."""
+    """Its mean is unknown, so it is taken for 0; half of the rest would be negative."""
     scan, _ = responding({'scatter0_1': 0.02}, scatter='one')
     search = lm.calibrate(scan, scatter=True, progress=False).found
     assert (

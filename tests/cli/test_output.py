@@ -204,7 +204,7 @@ def test_save_goes_by_the_same_rules(result, tmp_path):
     ],
 )
 def test_no_result_depends_on_a_name(scene, tmp_path, name):
-    """Of a volume and of the folder: what is written is written, and shown as text."""
+    """Names of a volume and of the folder are written, and shown as text."""
     volume, out = tmp_path / os.fsdecode(name + b'.nii.gz'), tmp_path / os.fsdecode(name)
     write_volume(volume, np.random.default_rng(0).random((12, 12, 12)), Grid(12, 1))
     code, text, err = fit(scene, *QUICK, '--volume', volume, '--out', out, report=True)
@@ -229,7 +229,7 @@ def test_a_report_that_cannot_be_drawn_is_a_warning(scene, result):
 
 @pytest.mark.thorough
 def test_a_home_and_caches_that_cannot_be_written(scene, tmp_path):
-    """Not even by root."""
+    """Even root cannot write them."""
     nowhere = dict.fromkeys(('HOME', 'XDG_CACHE_HOME', 'XDG_CONFIG_HOME', 'MPLCONFIGDIR'), '/proc/none')
     nowhere['CUDA_ON_CPU_CACHE'] = str(tmp_path / 'kernels')  # of a stand-in for the driver, which cannot do without
     process = fit_process(scene, *QUICK, '--out', tmp_path / 'a', env=os.environ | nowhere)

@@ -129,7 +129,7 @@ def test_projections_and_volumes(home):
 
 
 def test_another_scan_of_the_same_name_is_another_request(home):
-    """Also where the file has the same size, and where only what lies beside it has changed."""
+    """This holds also if the file has the same size, and if only a file beside it has changed."""
     geometry = lm.Geometry.cone(
         DSO=100, DSD=150, nDetector=(20, 24), dDetector=1.8, nVoxel=16, dVoxel=1.5, angles=np.linspace(0, 3, 7)
     )
@@ -276,7 +276,7 @@ def test_names_that_are_no_folder(home, name):
 
 
 def test_names_that_collide(home):
-    """Also where only some file systems take them for the same."""
+    """They collide also if only some file systems take them for the same."""
     (home / 'list.csv').write_text(
         'name,geometry\nFoot,tiny.xml\nfoot,tiny.xml\nüber,tiny.xml\nu\u0308ber,tiny.xml\n,tiny.xml\n,tiny.xml\n'
     )

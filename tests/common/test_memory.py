@@ -13,7 +13,7 @@ from lingo_mi.common.gpu import GPU, resident_warps
 
 
 def test_limits_of_control_groups(tmp_path):
-    """Those of the group and of all around it; in a container a group's own path may not be there."""
+    """The limits of the group and of all groups around it hold; in a container a group's own path may be missing."""
 
     def write(name, text):
         path = tmp_path / name

@@ -33,7 +33,7 @@ CARRIED = {  # the last one is taken
 
 @pytest.mark.parametrize('system', CARRIED)
 def test_the_newest_llvm_of_the_environment(no_llvm, monkeypatch, tmp_path, system):
-    """Of pip's package on Linux, and of conda's on each system."""
+    """It comes from pip's package on Linux, and from conda's on each system."""
     monkeypatch.setattr(sys, 'platform', system)
     monkeypatch.setattr(sys, 'prefix', str(tmp_path))
     monkeypatch.setattr(runtime, '_INSTALLED', {})

@@ -29,7 +29,7 @@ def flat(value):
 
 @pytest.mark.parametrize('photons, transmission, electronic', [(1e5, 0.3, 0.0), (20, 0.25, 0.0), (100, 0.1, 5.0)])
 def test_mean_and_variance(photons, transmission, electronic):
-    """Of 18000 pixels: the mean within four standard errors, the sum of squares by chi-square."""
+    """For 18000 pixels, the mean is within four standard errors, and the sum of squares passes a chi-square test."""
     d = detector(photons=float(photons), electronic_noise=electronic)
     counts = d.signal(flat(transmission), 0) * photons
     mean, variance = photons * transmission, photons * transmission + electronic**2

@@ -146,7 +146,7 @@ def test_two_materials():
 @physics
 @pytest.mark.parametrize('materials', [('water',), ('soft tissue', 'bone')])
 def test_derivative_of_hardening(materials):
-    """By every material's line integral, against differences of the float64 form."""
+    """Derivatives by every material's line integral agree with differences of the float64 form."""
     spectrum = tube_spectrum(120.0)
     ratios = [attenuation(m, spectrum.energies) / attenuation(m, [60.0]) for m in materials]
     bands = band(spectrum.detected('energy'), ratios, 4, 10.0)

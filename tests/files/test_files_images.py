@@ -42,7 +42,7 @@ def test_thin_images(tmp_path, shape):
 
 
 def test_memory_that_an_image_needs(tmp_path, monkeypatch):
-    """Its pixels twice, 4 bytes each."""
+    """It needs its pixels twice, 4 bytes each."""
     asked = []
     monkeypatch.setattr(images, 'require_room', lambda size, *_: asked.append(size))
     write_exr(tmp_path / 'a.exr', IMAGE)

@@ -152,7 +152,7 @@ def test_no_end_of_the_header(tmp_path):
     ],
 )
 def test_types(tmp_path, name, dtype):
-    """Those of the format's description; its long has 4 bytes."""
+    """The types of the format's description are read; its long has 4 bytes."""
     data, _ = read_metaimage(written(tmp_path / 'v.mha', VALUES.astype(dtype).tobytes('F'), ElementType=name))
     assert data.dtype == dtype
     np.testing.assert_array_equal(data, VALUES)

@@ -122,7 +122,7 @@ def test_matrices_by_hand():
 
 @pytest.mark.parametrize('step', [0.01, 1.0, 100.0])
 def test_a_matrix_is_parallel_to_rounding(step):
-    """Its last row, by the other rows' largest entry: one per pixel's size."""
+    """Its last row is zero relative to the other rows' largest entry: one per pixel's size."""
     g = circle(DSO=0.0, DSD=0.0, nDetector=SHAPE, dDetector=step, **GRID, angles=[0.0], mode='parallel')
     P = to_matrices(g.rays())
     P[0, 2, 0] = 0.5e-9 / step
@@ -458,7 +458,7 @@ def test_bad_poses_in_yaml(tmp_path, changes, match):
 
 
 def test_what_rtk_calls_its_numbers(tmp_path):
-    """Its reader looks for these names, and takes what is absent for zero."""
+    """RTK's reader looks for these names, and takes absent ones for zero."""
     rtk.write_rtk(tmp_path / 'g.xml', scan_of().rays(), SHAPE)
     (shared, *views) = ElementTree.parse(tmp_path / 'g.xml').getroot().iter()
     names = {e.tag for e in (shared, *views)}

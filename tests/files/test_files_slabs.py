@@ -79,7 +79,7 @@ def test_ome_zarr(tmp_path, thickness):
 
 
 def test_ome_zarr_is_valid(tmp_path):
-    """By the models of the specification, written by others."""
+    """Other authors' models of the specification accept it."""
     models = pytest.importorskip('ome_zarr_models.v05')
     zarr = pytest.importorskip('zarr')
     write_slabs(tmp_path / 'v.ome.zarr', geometry((70, 20, 10)).grid, slabs(noise((70, 20, 10)), 10))

@@ -25,7 +25,7 @@ from lingo_mi.storage import file_access
 @pytest.mark.parametrize('suffix', ['.nii', '.nii.gz'])
 @pytest.mark.parametrize('scale', [1, 700])
 def test_our_nifti_round_trips_unchanged(tmp_path, suffix, scale):
-    """Also with values that a stranger's file would have divided by their maximum or clipped."""
+    """This holds also for values that would be divided by their maximum or clipped in a stranger's file."""
     path = tmp_path / f'v{suffix}'
     data = ((COUNTS / 100 - 0.9) * scale).astype(np.float32)
     write_volume(path, data, Grid(SHAPE, SPACING, (1.75, 4.0, 9.25)), description='1/mm')

@@ -34,7 +34,7 @@ def centres_of(method, scan):
 
 
 def test_the_result_is_the_mean_since_the_last_densification():
-    """Of SHORT's, after iterations 6 and 12: the mean begins with the parameters after the next step."""
+    """SHORT densifies after iterations 6 and 12: the mean begins with the parameters after the next step."""
     scan = tiny_scan(geometry())
     fitted, seen = centres_of(AVERAGED, scan)
     assert fitted.state.born.any() and len(seen) == 16

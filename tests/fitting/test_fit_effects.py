@@ -146,7 +146,7 @@ def test_the_fit_sees_what_the_integrator_renders(name, tmp_path):
 @physics
 @pytest.mark.parametrize('name', EFFECTS)
 def test_derivatives_by_differences(name):
-    """Of the loss by densities, scales and centres, through the model."""
+    """Derivatives of the loss by densities, scales and centres, through the model."""
     stepper, state = stepper_of(EFFECTS[name](), lambda_tv=0.0)
     target = stepper.targets[1]
     stepper.share = stepper.model.shares(state)

@@ -107,7 +107,7 @@ def test_device_twin_agrees(n):
 
 
 def test_activation_derivatives():
-    """Of the device twin, against differences of the host's; where float32 saturates they stay finite."""
+    """The device's derivatives agree with differences on the host; they stay finite if float32 saturates."""
     state = random_state(np.random.default_rng(4), 5)
     device = DeviceState(state)
     dr.enable_grad(list(device.values.values()))

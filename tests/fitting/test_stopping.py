@@ -97,7 +97,7 @@ def test_resumed_it_is_the_same(scan, whole, tmp_path, where, sums_in_order):
 
 
 def test_the_search_has_the_rates_of_the_fit(scan, monkeypatch):
-    """Those of alpha compositing are in units of the radius of the scene, which fewer views tell a little otherwise."""
+    """Rates of alpha compositing are in units of the scene's radius, which is slightly different for fewer views."""
     splatting, searched = METHODS['3dgs'].changed(stop='on'), []
 
     def running(scan, seen, method, seed, stored, search, search_method):

@@ -139,7 +139,7 @@ def test_derivatives_of_images(kind, views):
 
 
 def test_the_closed_form_agrees():
-    """By the float64 form that the published errors are measured against, one view alone."""
+    """It is the float64 form of the published errors, for one view alone."""
     g, cloud = scan(), gaussians()
     weights = np.random.default_rng(3).normal(size=g.nDetector)
     image, expected = image_and_gradients([getattr(cloud, n) for n in NAMES], g.rays()[[1]], g.nDetector, weights)

@@ -18,7 +18,7 @@ def points(text):
 
 
 def parts(geometry):
-    """Of both sides: sources [n, 2], corners of the panel [5, 2], of the volume [4, 2], and rays [4, 2, 2]."""
+    """Parts of both drawings: sources [n, 2], corners of the panel [5, 2] and of the volume [4, 2], and rays [4, 2, 2]."""
     svg = drawing(geometry.rays(), geometry.nDetector, geometry.grid)
     lines = [
         (points(p), colour) for p, colour in re.findall(r'<polyline points="([^"]*)" fill="none" stroke="([^"]*)"', svg)

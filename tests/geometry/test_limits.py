@@ -107,7 +107,7 @@ def test_extreme_numbers_together(beam):
 
 
 def test_usual_numbers_are_far_from_the_limits():
-    """Of a synchrotron with a detector of 10 nm, of a parallel beam as a cone of 1000 km, in metres, in nanometres."""
+    """Scans of a synchrotron with a detector of 10 nm, and of a parallel beam as a cone of 1000 km, in metres and nanometres."""
     for changes in (
         dict(DSO=1.5e5, DSD=1.5e5 + 1, dDetector=1e-5, dVoxel=1e-5),
         dict(DSO=1e9, DSD=1e9 + 100),

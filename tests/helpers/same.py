@@ -24,7 +24,7 @@ def assert_same(actual, expected):
 
 
 def assert_same_volume(actual, expected):
-    """Of an iterative method, which amplifies rounding: to the last bit, or to a thousandth of its norm."""
+    """Compare volumes of an iterative method, which amplifies rounding: to the last bit, or to a thousandth of the norm."""
     if adds_in_any_order():
         assert np.linalg.norm(actual - expected) < 1e-3 * np.linalg.norm(expected)
     else:

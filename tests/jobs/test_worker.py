@@ -18,7 +18,7 @@ distributed = pytest.importorskip('distributed')
 
 @pytest.fixture(scope='module')
 def client():
-    """Of two workers that are threads of this process."""
+    """A client of two workers that are threads of this process."""
     options = dict(processes=False, n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0)
     with distributed.LocalCluster(**options) as local, distributed.Client(local, set_as_default=False) as client:
         yield client

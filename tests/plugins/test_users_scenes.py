@@ -99,7 +99,7 @@ def test_crop_window_of_a_detector():
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_turned_instance_is_a_turned_scanner(mode):
-    """Of every kind of object: a turn by -20 degrees about the axis is an angle of 20 degrees more."""
+    """For every kind of object, a turn by -20 degrees about the axis is an angle of 20 degrees more."""
     scanner = dict(SCANNER, mode=mode)
     image = render(load(instance(transform().rotate([0, 0, 1], -20)), scanner))
     np.testing.assert_allclose(image, render(load(everything(), dict(scanner, angles='53'))), rtol=1e-5, atol=3e-6)

@@ -66,7 +66,7 @@ def test_projector_classes():
 
 @pytest.mark.parametrize('kind', [Joseph, TiltedJoseph])
 def test_backprojections_agree(kind):
-    """Of one voxel after the other, the pixels that gather it are those it is projected to."""
+    """For one voxel after the other, the pixels that gather it are the pixels that it is projected to."""
     geometry = GEOMETRIES['flying spot']
     A = kind(geometry)
     y = np.random.default_rng(1).random((3, *geometry.nDetector), np.float32)

@@ -109,7 +109,7 @@ def test_images_and_gradients(scanner, name):
 
 
 def test_a_column_is_a_flat_panel_of_its_own(scanner):
-    """Its image is the same to rounding, also of Gaussians that the panel cuts or that reach to the source."""
+    """Its image is the same to rounding, also for Gaussians that the panel cuts or that reach to the source."""
     rays, (rows, columns) = scanner.rays(curved=True), scanner.nDetector
     cloud = cloud_of() + Cloud(
         np.array([rays.source[0] - 0.02, [0.9, -0.9, 1.2]]),

@@ -27,7 +27,7 @@ def test_means_over_larger_voxels(axis, over):
 
 @pytest.mark.parametrize('over', [2, 3, 4])
 def test_means_lie_in_the_middle_of_their_voxels(over):
-    """Of a symmetric object, on a grid that is symmetric about it but ends between its voxels, also at its faces."""
+    """This holds for a symmetric object on a grid that is symmetric about it but ends between its voxels, also at its faces."""
     half = np.random.default_rng(1).random((5, 1, 1))
     values = np.concatenate([half, half[::-1]])
     corner, step = LOW + np.array([(10 - 5 * over) / 2, 0, 0]), np.array([over, 1.0, 1.0])

@@ -216,7 +216,7 @@ def test_values_predict_views_and_means_the_truth(finer_scan):
 
 
 def test_means_over_the_cubes_of_an_interpolation():
-    """By trilinear interpolation at many points, far from the border; `values` undoes most of it."""
+    """The reference is trilinear interpolation at many points, far from the border; `values` undoes most of it."""
     volume = gaussian_filter(np.random.default_rng(0).normal(size=(9, 9, 9)), 1.0)
     points = (np.arange(20) + 0.5) / 20 - 0.5
     around = np.stack(np.meshgrid(*[4 + points] * 3, indexing='ij'))

@@ -171,7 +171,7 @@ def test_slopes_and_their_transpose():
 
 
 def test_the_gradient_of_huber(noisy):
-    """Of a float64 definition, by central differences; and `curvature` is a bound."""
+    """It agrees with central differences of a float64 definition, and `curvature` is a bound."""
     prior, delta = Huber(delta=0.15), 0.15
 
     def cost(z):

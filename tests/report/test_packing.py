@@ -90,7 +90,7 @@ def test_the_worst_volume_stays_within_the_budget(size):
 
 
 def test_budgets_leave_room():
-    """Of 30 MB: the volumes', the views', libraries, cloud and surfaces."""
+    """They share 30 MB: volumes, views, libraries, cloud and surfaces."""
     from lingo_mi.report import payload, template
 
     libraries = len(template._script())

@@ -26,7 +26,7 @@ SHAPE = 12, 10, 8
 
 @pytest.fixture(scope='module')
 def checkpoints(tmp_path_factory):
-    """Of two fits that differ in their seed and a setting, each in a folder of its own."""
+    """Checkpoints of two fits that differ in their seed and a setting, each in a folder of its own."""
     geometry = lm.Geometry.cone(
         DSO=100, DSD=150, nDetector=(6, 7), dDetector=(0.5, 2.0), nVoxel=SHAPE, dVoxel=2, angles=lm.circular(4)
     )
@@ -83,7 +83,7 @@ def test_a_fit_that_was_not_saved(pair):
 
 
 def test_a_map_of_errors_is_that_of_its_volume(tmp_path):
-    """Not of another that was there before."""
+    """It does not belong to another volume that was there before."""
     volume, plan = np.random.default_rng(0).random(SHAPE).astype(np.float32), tmp_path / 'v-plan.json'
     for name in ('v', 'v-error'):
         write_volume(tmp_path / f'{name}.nii.gz', volume, Grid(SHAPE, 2.0), 'density per mm')

@@ -133,7 +133,7 @@ def test_ctrl_c_while_a_scene_loads(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize('then', [None, ValueError('something else')])
 def test_ctrl_c_that_a_plugin_swallows(tmp_path, monkeypatch, then):
-    """By a signal, as from a terminal; the plugin goes on, or makes another error of it."""
+    """It comes as a signal, as from a terminal; the plugin goes on, or makes another error of it."""
     from lingo_mi.plugins import ct_volume
 
     make = ct_volume.make

@@ -10,7 +10,7 @@ pytestmark = pytest.mark.usefixtures('no_report')
 
 
 def checkpoint(folder, method, **settings):
-    """Of a short fit of three views."""
+    """The checkpoint of a short fit of three views."""
     scan = dict(DSO=100, DSD=150, nDetector=24, dDetector=3, nVoxel=16, dVoxel=2, angles=lm.circular(3))
     data = lm.simulate(lm.phantom('foot', size=16).data, lm.Geometry.cone(**scan), progress=False)
     lm.fit(data, method, progress=False, folder=folder / 'fit', **settings)

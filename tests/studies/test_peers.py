@@ -55,7 +55,7 @@ def peers(monkeypatch, capsys, tmp_path, scan):
 
 
 def test_a_volume_of_smaller_voxels_is_judged_on_its_own_grid(monkeypatch, scan, tmp_path):
-    """Its views from the smaller voxels, and its means against the reference."""
+    """Its views come from the smaller voxels, and its means are compared with the reference."""
     dataset = Dataset(read_scan(scan).train.on(Grid((16, 16, 16), (2.4, 2.4, 2.4))))
     reference = Study(dataset, tmp_path / 'reference').reference()
     for finer in (1, 2):

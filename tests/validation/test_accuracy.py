@@ -140,7 +140,7 @@ def test_affine_adds_no_kernel(cone):
 
 @pytest.mark.parametrize('output', ['line_integral', 'transmission'])
 def test_pixel_quadrature_converges(variant, output):
-    """By a factor of four from n to 2 n: a midpoint rule."""
+    """The error falls by a factor of four from n to 2 n: a midpoint rule."""
     work = Workload(60, 64, 80.0, order=4)
 
     def image(n):

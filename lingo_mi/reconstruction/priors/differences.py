@@ -11,7 +11,7 @@ LARGEST = 12.0  # a bound on |differences|^2 in three dimensions
 
 
 def places(size: tuple[int, int, int]) -> tuple[Any, tuple[tuple[Any, Any, Any], ...]]:
-    """Of all voxels: index, and for each axis its place there, the number of voxels and the stride."""
+    """Return the index of every voxel, and for each axis its place there, the number of voxels and the stride."""
     nx, ny, nz = (dr.opaque(mi.UInt32, n) for n in size)
     i = dr.arange(mi.UInt32, size[0] * size[1] * size[2])
     line = i // nz

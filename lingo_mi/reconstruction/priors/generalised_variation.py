@@ -96,7 +96,7 @@ def _edges(size):
 
 
 def _masks(size):
-    """Of the derivative along axis a of component c, whether both of its ends exist, by (a, c)."""
+    """Return, by (a, c), whether the derivative of component c along axis a has both of its ends."""
     axes, edges = places(size)[1], _edges(size)
     return {
         (a, c): edges[c] & ((axes[a][0] + 2 if a == c else axes[a][0] + 1) < axes[a][1])

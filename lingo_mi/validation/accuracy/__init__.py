@@ -52,7 +52,7 @@ def measure(sizes: Sizes, progress: Callable[[str], object] | None = None) -> di
 
 
 def measure_presets(sizes: Sizes) -> dict:
-    """Of `measure` the conditions and the presets' cut-offs, which need no ray tracing."""
+    """Return the conditions and the presets' cut-offs of `measure`, which need no ray tracing."""
     work = Workload(sizes.gaussians, sizes.pixels, sizes.box)
     return dict(conditions=_conditions(sizes), cutoff=images.cutoff(work, sizes, PRESETS.values()))
 

@@ -21,7 +21,7 @@ VOLUMES = ('aneurism', 'engine', 'teapot', 'tooth', 'chest_lidc0314', 'abdomen_t
 
 
 def available(names: Iterable[str], say: Callable[[str], object]) -> list[str]:
-    """Those of the objects that are there: phantoms, and volumes NAME.nii.gz in the folder that LINGO_MI_DATA names.
+    """Return the objects that exist: phantoms, and volumes NAME.nii.gz in the folder that LINGO_MI_DATA names.
 
     Parameters
     ----------

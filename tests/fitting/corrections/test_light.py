@@ -66,7 +66,7 @@ def test_the_fit_sees_what_the_integrator_renders(effects, tmp_path):
 
 @pytest.mark.traces_rays
 def test_the_light_is_a_constant_to_the_derivatives():
-    """Of the loss by the densities, against differences with the light held fixed; without the light they are others."""
+    """Derivatives of the loss by the densities agree with differences at fixed light; without the light they differ."""
     stepper, state = stepper_of(effects_of(), lambda_tv=0.0)
     target, plain = stepper.targets[1], state.values['density']
     results = {}

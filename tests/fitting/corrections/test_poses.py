@@ -34,7 +34,7 @@ def misaligned(g, seed=5, degrees=0.5, mm=1.0):
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel', 'curved'])
 def test_derivatives_by_differences(mode):
-    """Of the loss by the six numbers of a view's motion, at a view that has been moved."""
+    """Derivatives of the loss by the six numbers of a view's motion agree with differences, at a moved view."""
     flat = geometry(3, mode=mode.replace('curved', 'cone'))
     g = flat.curved(300.0) if mode == 'curved' else flat
     # Smooth, for differences: nothing is cut off, and the measured views are above the rendered ones everywhere (L1).

@@ -51,7 +51,7 @@ def rms(x):
     ],
 )
 def test_what_the_detector_did_is_found(values, changes, within, better):
-    """Of 8 views in 600 steps: air of 0.08 to 0.01, gains of 6 % to 1 %. The line integrals are better, too."""
+    """From 8 views in 600 steps: air of 0.08 to 0.01, gains of 6 % to 1 %. The line integrals are better, too."""
     ideal = true_views()
     scan, true = measured(ideal, **values)
     off, on = (run(scan, LONG.changed(n=300, **options), seed=3) for options in ({}, changes))

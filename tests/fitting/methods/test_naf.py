@@ -57,7 +57,7 @@ def test_it_learns_the_object(learnt):
 
 @pytest.mark.parametrize('factor', [pytest.param(0.02, marks=pytest.mark.thorough), 50])
 def test_it_learns_densities_of_any_unit(factor, learnt):
-    """Of matter, about 0.02 per mm; and beyond 1, which the published form cannot reach."""
+    """Densities are those of matter, about 0.02 per mm, or beyond 1, which the published form cannot reach."""
     scan, fitted = learnt
     scaled = replace(scan, projections=scan.projections * np.float32(factor))
     refitted = fit(scaled, fitted.method.changed(iterations=150))

@@ -27,7 +27,7 @@ def start(of, n_points=300, seed=0, factor=1.0, within='masks') -> StartingCloud
 
 
 def distances(cloud, of):
-    """Of the points from the ball's centre, in radii."""
+    """Distances of the points from the ball's centre, in radii."""
     g = of.geometry
     return np.linalg.norm(cloud.points / g.grid.scale + np.array(g.grid.centre) - CENTRE, axis=1) / RADIUS
 

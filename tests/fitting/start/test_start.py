@@ -23,7 +23,7 @@ from lingo_mi.reconstruction.fdk import FDK
     ],
 )
 def test_the_seconds_are_those_of_all_steps(monkeypatch, method, changes, waited):
-    """By a clock on which an FDK reconstruction takes 7 seconds, and nothing else any time."""
+    """On this clock an FDK reconstruction takes 7 seconds, and nothing else any time."""
     now, method = [100.0], METHODS[method].changed(**changes)
 
     class Slow(FDK):
