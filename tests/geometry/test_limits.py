@@ -77,9 +77,14 @@ def variants(value, name):
 
 
 def in_short_form(beam, name):
-    """All numbers of a scan by views, which takes those of the others; of these, what only they have, and a motion each."""
+    """All numbers of a scan by views and of a circle, which the others have, too; what only the others have, and a motion."""
     motion = dict(cone='COR', parallel='rotDetector', helix='height', circle='offDetector')
-    return beam == 'per_view' or name == motion[beam] or name not in BEAMS['per_view'][2]
+    return (
+        beam == 'per_view'
+        or name == motion[beam]
+        or name not in BEAMS['per_view'][2]
+        or (beam == 'cone' and name in CONE)
+    )
 
 
 @pytest.mark.parametrize(
