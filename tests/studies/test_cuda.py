@@ -218,6 +218,7 @@ STAND_IN = """#!/bin/sh
 [ -z "$MODULE" ] || printf '%s' "$MODULE" > "$CUDA_ON_CPU_DUMP/twice.ptx"
 exec "$@"
 """
+OPTION = 'def pytest_addoption(parser):\n    parser.addoption("--all", action="store_true")\n'
 PASSES = 'def test_once():\n    import pathlib\n    pathlib.Path("ran.txt").open("a").write("x")\n'
 
 
@@ -226,6 +227,8 @@ def checkout(tmp_path, monkeypatch):
     """A checkout of three test files, and a program that runs them."""
     tests, stand_in = tmp_path / 'tests', tmp_path / 'stand_in'
     (tests / 'part').mkdir(parents=True)
+    (tmp_path / 'pytest.ini').write_text('[pytest]')
+    (tests / 'conftest.py').write_text(OPTION)
     (tests / 'part/test_a.py').write_text(PASSES)
     (tests / 'test_b.py').write_text(PASSES + 'def test_more():\n    import pytest\n    pytest.skip("no room")\n')
     (tests / 'test_c.py').write_text('def test_fails():\n    assert 0\n')
