@@ -3,9 +3,9 @@
     python -m studies.box_voxels x3d_aneurism aneurism_boxes.pickle
     lingo-mi fit x3d_aneurism --projections aneurism_boxes.pickle --method r2
 
-X3D's views are made by TIGRE's default projector, Siddon's, which takes a voxel for a box. Those of this package are exact for
+X3D's views are made by TIGRE's default projector, Siddon's, which takes a voxel for a box. This package's views are exact for
 the trilinear interpolant of voxels. Here every voxel is cut into --cut pieces a side of its own density, whose interpolant is
-constant but within half a piece of its faces. What is scanned is the scene's true volume on the scanner's voxels.
+constant but within half a piece of its faces. The scanned object is the scene's true volume on the scanner's voxels.
 """
 
 from __future__ import annotations

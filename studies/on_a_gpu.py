@@ -1,11 +1,11 @@
-"""Measure what needs an NVIDIA GPU, in nine minutes, the most important first: `python -m studies.on_a_gpu`.
+"""Run the measurements that need an NVIDIA GPU, in nine minutes, the most important first: `python -m studies.on_a_gpu`.
 
     python -m studies.on_a_gpu
     python -m studies.on_a_gpu --stand-in PROGRAM --out out/rehearsal
 
-Each part is a process of its own with a limit of time. What it prints, and the files that it makes, are in the folder --out as
-soon as it ends. A part that fails, or that runs out of time, does not stop the next one. `summary.md` has a line for each part.
-The exit code is 1 if a part failed. Nothing needs a network.
+Each part is a process of its own with a limit of time. Its output and its files are in the folder --out as soon as it ends. A
+part that fails, or that runs out of time, does not stop the next one. `summary.md` has a line for each part. The exit code is 1
+if a part failed. Nothing needs a network.
 
 With --stand-in, the same commands run at small sizes under a program that stands in for the CUDA driver (see `studies.cuda`).
 Their times mean nothing, but they show before a GPU is at hand that every command works.

@@ -64,13 +64,13 @@ def order_faults(scan: Scan) -> list[str]:
             'the views predict each other hardly better than in a random order: check the angles (one for each view, and their '
             'unit), the order of the frames, and the distances'
         ]
-    # A parallel beam tells no sense: the mirrored object explains reversed angles as well.
+    # A parallel beam does not determine the sense: the mirrored object explains reversed angles as well.
     if scan.geometry.mode == 'cone' and (opposite := times(turn)) < REVERSED:
         return [
             f'with reversed angles the views predict each other {1 / opposite:.2g} times as well: change the sign of the '
             'angles, or mirror the columns'
         ]
-    # What is wrong with the geometry grows and falls slowly from view to view; a view out of place stands out of its neighbours.
+    # Errors of the geometry grow and fall slowly from view to view; a view out of place stands out from its neighbours.
     others = ndimage.median_filter(differences, NEIGHBOURS, mode='mirror')
     odd = index[differences > ODD * np.maximum(np.median(differences), others)]
     if not len(odd):

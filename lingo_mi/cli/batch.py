@@ -6,7 +6,7 @@
 
 The list is a CSV file whose first line names its columns; an empty cell is the default, and paths begin from the list's folder:
 
-    file       projections, as for `lingo-mi fit --projections`; with a scene in geometry, a CT volume that its scanner scans
+    file       projections, as for `lingo-mi fit --projections`; with a scene in geometry, a CT volume for its scanner
     geometry   the geometry file (.yml) of an .npy; or a scene, .xml or a shipped one, whose own object is scanned without a file
     name       of the folder in --out (default: the name of the file)
     method, views, seed, mu_water   as for `lingo-mi fit`

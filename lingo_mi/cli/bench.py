@@ -9,7 +9,8 @@ pairs, in turn, so that both see the same machine; the best of five counts for b
 pair is a pixel in the bounding box of a Gaussian's footprint. The limit needs g++.
 
 Then, once, the same cloud and image by marching through the tree of `ellipsoids`, hit by hit, and both ways' errors
-against float64 on some of the pixels. That takes a minute; --no-bvh leaves it out. What was not measured is null in the JSON.
+against float64 on some of the pixels. That takes a minute; --no-bvh leaves it out. Numbers that were not measured are null in
+the JSON.
 """
 
 import argparse

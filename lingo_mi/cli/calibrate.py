@@ -1,5 +1,5 @@
-"""Find where a scanner's panel really is (an axis off centre, a panel turned in its plane, one that drifts), and what its
-detector makes of line integrals."""
+"""Find where a scanner's panel really is (an axis off centre, a turn of the panel in its plane, a drift), and the response of
+its detector to line integrals."""
 
 import argparse
 import warnings

@@ -1,4 +1,4 @@
-"""Look at a scan before work: geometry, air, noise, truncation, order of the views, angles and axis; and what to correct."""
+"""Check a scan before work: geometry, air, noise, truncation, order of the views, angles and axis; and name the corrections."""
 
 from __future__ import annotations
 

@@ -10,17 +10,16 @@
     lingo-mi reconstruct large.npy --algorithm fdk --cluster local:3 --out large.ome.zarr
     lingo-mi reconstruct x3d_foot --algorithm best --views 25 --report foot.html
 
-The input is what `lingo-mi fit` takes. With --complete, the views that were fitted are used, those missing to --views are
-rendered from the fit, and the volume is made of both; the scan must be one on a circle, before an upright panel, with every
-pixel. refined, which is the best for few clean views, starts from the fit's volume, meets all views first and the measured ones
-then; for objects finer than the voxels add -D finer=2. With --start, the volume is made of the views that were fitted, by refined
-or an iterative algorithm, from the fit's volume; any scan will do. Poses that the fit has corrected are used as it has left them,
-but not by fdk. If the true volume is known, PSNR and SSIM are printed, with its largest density for full scale, then with 1.
-best chooses its settings by measured views that it holds out, and needs no fit; with -D cloud=true it also fits a cloud, and
-tries to start from it. What it tried is printed, and written beside the volume V.nii.gz as V-plan.json; V-error.nii.gz shows
-where the volume is least certain, and is a layer of the page that --report writes.
-Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D effects=ignore is given;
-with --complete and --start, those that the fit has modelled.
+The input is the same as for `lingo-mi fit`. With --complete, the volume is made from the fitted views and from views that the
+fit renders, --views in all. The scan must be on a circle, before an upright panel, with every pixel. refined is the best for
+few clean views: it starts from the fit's volume, and fits all views first and then the measured ones. For objects finer than
+the voxels add -D finer=2. With --start, refined or an iterative algorithm starts from the fit's volume and uses the fitted
+views; any scan will do. All but fdk use the poses that the fit has corrected. If the true volume is known, PSNR and SSIM are
+printed, with its largest density for full scale, then with 1. best chooses its settings by measured views that it holds out,
+and needs no fit; with -D cloud=true it also fits a cloud, and tries to start from it. Its trials are printed, and written
+beside the volume V.nii.gz as V-plan.json. V-error.nii.gz shows where the volume is least certain, and is a layer of the page
+that --report writes. Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D
+effects=ignore is given. With --complete and --start, these are the effects that the fit has modelled.
 
 A volume larger than memory is made and written in slabs of --slab slices, by fdk, sart, os-sart, sirt, asd-pocs and voxelize. The
 iterative ones hold it in a folder beside it, with the name of the volume and .slabs, until it is written. If they are

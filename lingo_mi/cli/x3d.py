@@ -10,9 +10,9 @@ controls (further rows of Table 3, which separate what the loss scale does from 
 and scenes (volumes from all 50 views, beside published ones). A scene is named after its file: foot_50.pickle is foot.
 
 All 15 scenes need a GPU or a cluster. Each fit and each reconstruction is stored as soon as it is done. After any interruption
-the same command goes on, and other tables use what is there. A table, as Markdown and JSON, is updated after every one of them,
-with TABLE.provenance.json beside it, which says how. --record keeps the numbers of all cells in one file, from which a table can
-be continued on another machine without the checkpoints.
+the same command goes on, and other tables use what is there. A table, as Markdown and JSON, is updated after each of them.
+TABLE.provenance.json beside it says how it was made. --record keeps the numbers of all cells in one file, from which a table
+can be continued on another machine without the checkpoints.
 """
 
 import argparse

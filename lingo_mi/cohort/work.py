@@ -24,7 +24,7 @@ PATIENCE = 60.0  # seconds: a worker that has lost its scheduler stops after its
 def fit_row(row: Row, out: str, *, report: Callable[..., None]) -> dict:
     """Fit a row's scan into the folder `out`/NAME: from its checkpoint, if there is one. Returns the metrics of the result.
 
-    What is there already is not done again.
+    Finished work is not done again.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Images and volumes in a notebook: HTML with one sprite each, and a slider over its frames.
 
-Everything is in the markup, so that it stays in a saved notebook and in pages that are built from one. Where scripts are off, the
-frame in the middle is seen.
+Everything is in the markup, so that it stays in a saved notebook and in pages that are built from one. If scripts are off, the
+middle frame shows.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ LLVM_HELP = (
 # Below the folder of an environment: pip's karellen-llvm-core, and conda's libllvm.
 _IN_ENVIRONMENT = {'darwin': ('lib/libLLVM.*dylib',), 'win32': ('Library/bin/LLVM-C*.dll',)}
 _LINUX = 'lib/libLLVM.so*', 'lib/libLLVM-*.so'
-# Where Homebrew and the installer for Windows put it, in which Dr.Jit does not look.
+# Folders of Homebrew and of the installer for Windows, which Dr.Jit does not search.
 _INSTALLED = {'darwin': '/opt/homebrew/opt/llvm/lib/libLLVM.dylib', 'win32': r'C:\Program Files\LLVM\bin\LLVM-C.dll'}
 
 

@@ -4,8 +4,8 @@ Besides the NAF pickle (`naf`) and the R2-Gaussian folder (`r2`):
 
 Projections with a geometry file (`geometry_file`): `scan.npy` [n, v, u] and `scan.yml`.
 
-Projections in chunks: `scan.zarr`, a Zarr array [n, v, u], and `scan.yml` as above. What works on slabs reads the views
-that it needs; all else reads them all.
+Projections in chunks: `scan.zarr`, a Zarr array [n, v, u], and `scan.yml` as above. Work on slabs reads the views that it
+needs, and all other work reads all views.
 
 A folder of EXR images: `geometry.yml` as above (with `test_angles` or `test_poses` if there are held-out views),
 `train/0000.exr` …, `test/0000.exr` …, each one view, and `volume.nii.gz` if the true volume is known.

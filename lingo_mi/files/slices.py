@@ -132,8 +132,8 @@ def read_tiff_file(path: Path) -> np.ndarray:
     try:
         with reading(path):
             require_chain(path)
-        # What some microscopes' own descriptions say is not followed: to other files, or to more images than there are. The
-        # kinds that tifffile (from 2026.4) finds by the first image's tags alone cannot be set.
+        # Some microscopes' own descriptions lead to other files, or to more images than exist, and are not followed. The kinds
+        # that tifffile (from 2026.4) finds by the first image's tags alone cannot be set.
         kinds = (f'is_{kind}' for kind in tifffile.TIFF.FILE_FLAGS - _KINDS)
         others = {kind: False for kind in kinds if not isinstance(getattr(tifffile.TiffFile, kind, None), property)}
         with quiet('tifffile'), reading(path), tifffile.TiffFile(path, _multifile=False, **others) as file:

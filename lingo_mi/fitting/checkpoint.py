@@ -134,7 +134,7 @@ class Checkpoint:
     def load(cls, path: PathLike | str) -> Checkpoint:
         """The fit in a file.
 
-        Loading never runs code from the file, and takes no more memory than its size tells.
+        Loading never runs code from the file, and takes no more memory than its size suggests.
 
         Raises
         ------
@@ -168,7 +168,7 @@ class Checkpoint:
 
 
 def _read(path: PathLike | str) -> dict[str, np.ndarray]:
-    """The entries but for the checksum, by name. What they claim to hold is compared with the size of the file before memory is
+    """The entries without the checksum, by name. Their claimed sizes are compared with the size of the file before memory is
     taken."""
     status = os.stat(path)
     if not stat.S_ISREG(status.st_mode):

@@ -132,7 +132,7 @@ class Fit(FittedModel):
 
     @cached_property
     def numbers(self) -> dict:
-        """All numbers, with the history. What a loaded fit has no truth for is as it was saved."""
+        """All numbers, with the history. A loaded fit has the saved numbers where it lacks a truth."""
         numbers = fit_metrics(self)
         if self.data is None and self._stored:
             missing = {k: self._stored.get(k) for k, value in numbers.items() if value is None}

@@ -1,8 +1,8 @@
 """The end of a fit: a first fit, to part of the views, finds the step after which it predicts the other views no better.
 
-A fit of noisy projections is at its best before it has met them: later steps turn noise into structure, and what the views do not
-determine into streaks. Neither shows in the views that are fitted, nor in single pixels or rows that are held out of them,
-which are predicted better and better long after the volume has become worse. It shows in whole views, weighted as in
+A fit of noisy projections is at its best before it agrees with them: later steps turn noise into structure, and undetermined
+parts of the volume into streaks. The fitted views do not show this, and neither do single pixels or rows that are held out of
+them: their predictions improve long after the volume has become worse. Whole views that are held out show it, weighted as in
 `lingo_mi.reconstruction.held_out`.
 
 So there are two fits, each from its start. The first, the search, sees all views but some, and ends once these are predicted no

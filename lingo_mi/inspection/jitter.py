@@ -11,9 +11,9 @@ STEEPEST = np.radians(6)  # between views: beyond, an outline's own motion is no
 def outline_jitter(p: np.ndarray, angles: np.ndarray) -> tuple[float, float]:
     """Standard deviation in pixels of the outline's place, (along columns, along rows); nan if it cannot be determined.
 
-    The place along a row is the mean of the object's left and right edge, and that along a column the mean of its upper and
-    lower one. For independent errors of deviation s the third differences of neighbouring views have the deviation s sqrt(20).
-    Their median ignores single views. What the object's own corners add stays in: 0.02 to 0.1 pixels.
+    The place along a row is the mean of the object's left and right edge. The place along a column is the mean of its upper and
+    lower edge. For independent errors of deviation s the third differences of neighbouring views have the deviation s sqrt(20).
+    Their median ignores single views. The object's own corners add 0.02 to 0.1 pixels, which stay in.
 
     Parameters
     ----------

@@ -131,8 +131,8 @@ class Findings:
     mass_spread : float or None
         Relative standard deviation of the masses of the views of a parallel beam; None if they need not be equal.
     text_order : ndarray of shape (n,), or None
-        The place of every view in the order of the numbers, if the views were sorted as text; what else is said of the views is
-        of this order. None if they were not.
+        The place of every view in the order of the numbers, if the views were sorted as text; all other numbers about views use
+        this order. None if they were not.
     dead_columns : list of int
         Columns that show the same in all views; they are left out of what follows.
     black, doubled : list of int

@@ -1,4 +1,4 @@
-"""A job, what is told of it, and how it ends."""
+"""A job, its messages, and its end."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Job:
         Steps that it reports, for the progress.
     function : callable
         A function of a module, called as function(*arguments, report=report). It calls report(steps done, **fields) between its
-        steps, where KeyboardInterrupt says that it must stop; what it has stored by then it finds again.
+        steps, and a KeyboardInterrupt there says that it must stop. The next call finds what it has stored by then.
     arguments : tuple
         Arguments that pickle.
     """
@@ -62,7 +62,8 @@ class Runner(Protocol):
 
 
 def attempt(job: Job, report: Callable[..., None], tell: Tell) -> Event:
-    """Run a job here: its last event, 'done' or 'failed'. What no `InputError` explains is also printed with its traceback.
+    """Run a job here and return its last event, 'done' or 'failed'. Errors that are not an `InputError` are also printed with a
+    traceback.
 
     Parameters
     ----------

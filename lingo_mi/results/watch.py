@@ -1,4 +1,4 @@
-"""Watchers of a fit: they are told of its steps and shown its state, cost little, and never stop it."""
+"""Watchers of a fit: they receive its steps and its state, cost little, and never stop it."""
 
 from __future__ import annotations
 

@@ -65,4 +65,4 @@ class ResponsePart(ABC):
         return ''
 
     def hold(self) -> None:  # noqa: B027 - most models need none
-        """Take out of `values` what no scan tells."""
+        """Remove from `values` what a scan cannot determine."""

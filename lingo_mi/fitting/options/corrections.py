@@ -13,8 +13,8 @@ from lingo_mi.fitting.options.part import Part, require
 class Corrections(Part):
     """Corrections that are fitted with the cloud. All are off by default.
 
-    Time is told by the angles of the views, which must be in the order in which they were taken. A curve and scattered light,
-    which a cloud would explain away, are sought before a fit: `lm.calibrate`.
+    The angles of the views give their time, so the views must be in the order in which they were taken. A curve and scattered
+    light, which a cloud would absorb, are found before a fit: `lm.calibrate`.
 
     Parameters
     ----------
