@@ -77,7 +77,17 @@ class Method(Part, ABC):
 
     @abstractmethod
     def stepper(self, scan: Scan) -> Stepper:
-        """The optimisation on a scan.
+        """Return the optimisation on a scan.
+
+        Parameters
+        ----------
+        scan : Scan
+            The views to fit.
+
+        Returns
+        -------
+        Stepper
+            Before its first step.
 
         Raises
         ------
@@ -87,26 +97,65 @@ class Method(Part, ABC):
 
     @abstractmethod
     def model(self, geometry: Geometry, unit: float, effects: Effects | None = None) -> Model:
-        """Return the model that renders and voxelizes a state of a fit to a scan of this geometry.
+        """Return the model that renders and voxelizes a state of a fit.
 
         Parameters
         ----------
+        geometry : Geometry
+            Geometry of the fitted scan.
         unit : float
             The density that the fit counts as 1, in 1/mm.
         effects : Effects or None
             The effects of the scan that the fit models.
+
+        Returns
+        -------
+        Model
+            A model without parameters; its calls take a state.
         """
 
     def poses(self, geometry: Geometry) -> Poses | None:
-        """Corrections of the views' poses, all zero; None if the fit corrects none."""
+        """Return the corrections of the views' poses at the start.
+
+        Parameters
+        ----------
+        geometry : Geometry
+            Geometry of the scan.
+
+        Returns
+        -------
+        Poses or None
+            All zero; None if the fit corrects no poses.
+        """
         return None
 
     @abstractmethod
     def shapes(self, count: int) -> dict[str, tuple[int, int]]:
-        """Shapes of the parameters by name, for `count` Gaussians."""
+        """Return the shapes of the parameters.
+
+        Parameters
+        ----------
+        count : int
+            Number of Gaussians.
+
+        Returns
+        -------
+        dict[str, tuple[int, int]]
+            (rows, columns) of each parameter, by name.
+        """
 
     def bounded(self, scan: Scan) -> Self:
-        """The method with the limits that a scan sets.
+        """Return the method with the limits that a scan sets.
+
+        Parameters
+        ----------
+        scan : Scan
+            The views to fit.
+
+        Returns
+        -------
+        Method
+            A copy, in which `stop` is 'on' or 'off'.
 
         Raises
         ------
@@ -144,11 +193,37 @@ class Method(Part, ABC):
         return self.rates.average == 0 and self.rates.decay_steps > 0 and self.stopping.stop == 'off'
 
     def rate(self, name: str, iteration: int) -> float:
-        """Adam's step size for a parameter at an iteration, counted from 0."""
+        """Return Adam's step size for a parameter.
+
+        Parameters
+        ----------
+        name : str
+            Name of the parameter, such as 'centre'.
+        iteration : int
+            Iteration, counted from 0.
+
+        Returns
+        -------
+        float
+            Between the first and the last value of `rates.rate_NAME`.
+        """
         return self.falling(getattr(self.rates, f'rate_{name}'), iteration)
 
     def falling(self, pair: tuple[float, float], iteration: int) -> float:
-        """The rate between the first and the last of a pair, at an iteration."""
+        """Return the rate at an iteration between the first and the last of a pair.
+
+        Parameters
+        ----------
+        pair : tuple[float, float]
+            First and last rate.
+        iteration : int
+            Iteration, counted from 0.
+
+        Returns
+        -------
+        float
+            The rate, which falls log-linearly.
+        """
         return between(pair, min(iteration / max(self.rates.decay_steps or self.iterations, 1), 1.0))
 
 

@@ -108,7 +108,20 @@ class GaussianProjector(LinearMap):
         return images
 
     def by_density(self, y: Any) -> Any:
-        """`A.T.on_device`: the derivative of the product of images and `y` by the densities."""
+        """Apply the transpose to evaluated pixels on the device: `A.T.on_device`.
+
+        It is the derivative, by the densities, of the product of the images and `y`.
+
+        Parameters
+        ----------
+        y : mi.Float
+            Pixels of all images, flat.
+
+        Returns
+        -------
+        mi.Float [N]
+            A value for each Gaussian.
+        """
         pixels = self.range_shape[1] * self.range_shape[2]
         index = dr.arange(mi.UInt32, pixels)
         out = dr.zeros(mi.Float, self.domain_shape[0])

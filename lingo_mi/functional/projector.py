@@ -195,7 +195,18 @@ class Projector(LinearMap):
         return out
 
     def backproject(self, y: Any) -> Any:
-        """`A.T.on_device`."""
+        """Apply the transpose to evaluated pixels on the device: `A.T.on_device`.
+
+        Parameters
+        ----------
+        y : mi.Float
+            Pixels of all images, flat.
+
+        Returns
+        -------
+        mi.Float
+            Voxels, flat.
+        """
         pair, block = self._pair()
         out = pair.adjoint(dr.gather(mi.Float, y, _transposed(pair.panel[::-1], len(self))), block)
         dr.eval(out)

@@ -182,9 +182,23 @@ class ASDPOCS(Algorithm):
     def slabs(
         self, scan: Scan, thickness: int, folder: str | PathLike, *, progress: Progress | None = None
     ) -> Iterator[np.ndarray]:
-        """The volume in slabs of so many slices along z, as `Sweeps.slabs` gives it, whose arguments these are.
+        """Reconstruct the volume in slabs along z, as `Sweeps.slabs` does.
 
-        The folder holds four volumes.
+        Parameters
+        ----------
+        scan : Scan
+            Projections as for `lm.reconstruct`.
+        thickness : int
+            Slices of a slab.
+        folder : path-like
+            Folder of the work, which holds four volumes. The same call goes on with it.
+        progress : Progress or None
+            Called between the steps of all slabs.
+
+        Yields
+        ------
+        ndarray
+            Float32 [x, y, thickness], from the first slab on; the last may be thinner.
 
         Raises
         ------

@@ -285,20 +285,29 @@ class FDK(Algorithm):
         return images, geometry
 
     def slabs(self, scan: Scan, thickness: int, *, progress: Progress | None = None) -> Iterator[np.ndarray]:
-        """The volume in slabs of so many slices along z, [x, y, thickness], from the first; the last may be thinner.
+        """Reconstruct the volume in slabs along z.
 
-        Takes memory for two sets of projections and for three slabs, however large the volume. Stored views are read again for
+        It takes memory for two sets of projections and for three slabs, however large the volume. Stored views are read again for
         every slab, and take no memory for sets of them.
 
         Parameters
         ----------
+        scan : Scan
+            Projections as for `lm.reconstruct`.
+        thickness : int
+            Slices of a slab.
         progress : Progress or None
             Called as progress(views done in all slabs, views of all slabs, None).
+
+        Yields
+        ------
+        ndarray
+            Float32 [x, y, thickness], from the first slab on; the last may be thinner.
 
         Raises
         ------
         InputError
-            As `_run`, and for too little memory.
+            For a scan that `lm.reconstruct` refuses, and for too little memory.
 
         Examples
         --------
@@ -317,12 +326,19 @@ class FDK(Algorithm):
             yield views.slab(part, report)
 
     def filtered_views(self, scan: Scan, file: Path | None = None) -> FilteredViews:
-        """All views, weighted and filtered, for any number of slabs.
+        """Weight and filter all views, for any number of slabs.
 
         Parameters
         ----------
+        scan : Scan
+            Projections as for `slabs`.
         file : Path or None
             A new .npy for them (None: in memory). Stored views are filtered when they are needed.
+
+        Returns
+        -------
+        FilteredViews
+            The filtered views, which make slabs.
         """
         images, geometry = self.images(scan)
         if scan.stored is not None:
@@ -335,7 +351,20 @@ class FDK(Algorithm):
         return FilteredViews(geometry, views if file is None else file)  # which is complete once the array is gone
 
     def slab_steps(self, scan: Scan, thickness: int) -> int:
-        """The number of steps of `slabs`, for `progress`."""
+        """Return the number of steps of `slabs`, for `progress`.
+
+        Parameters
+        ----------
+        scan : Scan
+            Projections as for `slabs`.
+        thickness : int
+            Slices of a slab.
+
+        Returns
+        -------
+        int
+            Views times slabs.
+        """
         return len(scan) * len(scan.geometry.grid.slabs(thickness))
 
 

@@ -1,4 +1,4 @@
-"""What scripts/reconstruct.py refuses in one line, and what it warns of."""
+"""Input that scripts/reconstruct.py refuses in one line, and input that it warns of."""
 
 from dataclasses import replace
 

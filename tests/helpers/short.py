@@ -1,4 +1,4 @@
-"""Which of many like cases the short form of the tests runs."""
+"""The short form of the tests: a choice among many like cases."""
 
 from collections.abc import Iterable, Mapping
 

@@ -1,4 +1,4 @@
-"""What the integrator refuses in one line."""
+"""Scenes that the integrator refuses in one line."""
 
 import contextlib
 

@@ -50,7 +50,20 @@ class ImageLoss(Part):
         )
 
     def value(self, image: Any, measured: Any, height: int, width: int) -> Any:
-        """The loss of an image, Float [1]; image and measured pixels are Float [height * width]. Differentiable."""
+        """Compute the loss of an image. Differentiable.
+
+        Parameters
+        ----------
+        image, measured : Float [height * width]
+            Rendered and measured pixels, row by row.
+        height, width : int
+            Size of the image.
+
+        Returns
+        -------
+        Float [1]
+            The loss.
+        """
         return losses.combined(image, measured, height, width, self.lambda_ssim, self.lambda_gradient, self.lambda_l1)
 
 
@@ -92,7 +105,18 @@ class Loss(ImageLoss):
     loss_scale: str = 'none'
 
     def limited(self, views: int) -> Loss:
-        """The same for a scan of so many views: see `tv_views`."""
+        """Return the same loss for a scan of so many views: see `tv_views`.
+
+        Parameters
+        ----------
+        views : int
+            Views of the scan.
+
+        Returns
+        -------
+        Loss
+            With a smaller `lambda_tv` for more than `tv_views` views.
+        """
         if not 0 < self.tv_views < views:
             return self
         return replace(self, lambda_tv=self.lambda_tv * self.tv_views / views, tv_views=0)

@@ -56,7 +56,7 @@ class Start(Part, ABC):
 
     @abstractmethod
     def cloud(self, scan: Scan, rng: np.random.Generator, render: Render, unit: float) -> StartingCloud:
-        """The cloud for a scan.
+        """Make the initial Gaussians of a scan.
 
         Parameters
         ----------
@@ -69,6 +69,11 @@ class Start(Part, ABC):
         unit : float
             The density that the fit counts as 1, in 1/mm.
 
+        Returns
+        -------
+        StartingCloud
+            In the normalised frame.
+
         Raises
         ------
         InputError
@@ -76,9 +81,31 @@ class Start(Part, ABC):
         """
 
     def count(self, geometry: Geometry) -> int:
-        """The largest number of Gaussians, to ask for memory before the work; 0 if the start asks by itself."""
+        """Return the largest number of Gaussians, so that memory is asked for before the work.
+
+        Parameters
+        ----------
+        geometry : Geometry
+            Geometry of the scan.
+
+        Returns
+        -------
+        int
+            0 if the start asks by itself.
+        """
         return 0
 
     def limited(self, most: int) -> Start:
-        """The same with at most so many Gaussians, if their number is an option."""
+        """Return the same start with a limited number of Gaussians.
+
+        Parameters
+        ----------
+        most : int
+            Largest number of Gaussians.
+
+        Returns
+        -------
+        Start
+            A copy, or the same object if the number is not an option.
+        """
         return self

@@ -58,7 +58,20 @@ class Prior:
         return z
 
     def gradient(self, x: mi.Float, size: tuple[int, int, int]) -> mi.Float | None:
-        """The gradient of the smooth part of R, or None without a smooth part. x and size are as for `prox`."""
+        """Return the gradient of the smooth part of R.
+
+        Parameters
+        ----------
+        x : mi.Float
+            Densities, evaluated.
+        size : tuple of int
+            Voxels along x, y and z.
+
+        Returns
+        -------
+        mi.Float or None
+            Of the size of x; None without a smooth part.
+        """
         return None
 
     def begin(self) -> None:
