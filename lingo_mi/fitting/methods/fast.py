@@ -22,7 +22,8 @@ class Fast(DensityMethod):
     differs from the published one in these points:
 
     - Within the masks, Gaussians start on the edges of a quick reconstruction, and their densities are the densities of its
-    voxels. - The loss has the gradient of the difference beside L1, which restores fine detail sooner, and more weight on SSIM.
+      voxels.
+    - The loss has the gradient of the difference beside L1, which restores fine detail sooner, and more weight on SSIM.
     - Rates are 3 to 40 times higher and fall over the run. The second moment has a shorter memory, the first one is Nesterov's,
       and the result is the mean of the last steps.
     - Views in a row lie well apart.
