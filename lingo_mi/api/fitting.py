@@ -21,6 +21,7 @@ from lingo_mi.fitting.method import Method
 from lingo_mi.fitting.methods.by_name import method_of
 from lingo_mi.fitting.save import result_names
 from lingo_mi.inspection.measure import warn_of_intensities
+from lingo_mi.jobs.cluster import opened
 from lingo_mi.results.watch import watched
 from lingo_mi.results.watchers import watchers_of
 from lingo_mi.scan import Dataset, Scan
@@ -45,6 +46,7 @@ def fit(
     progress: bool | Callable[..., None] = True,
     live: bool = False,
     log_dir: str | PathLike | None = None,
+    cluster: Any = None,
     note: dict | None = None,
     **options: Any,
 ) -> Fit:
@@ -80,6 +82,10 @@ def fit(
         Serve a page that grows while the fit runs, to this machine alone. The fit prints its address; a notebook shows the page.
     log_dir : path, optional
         A folder for TensorBoard's events: numbers, slices, views (needs the extra 'tensorboard').
+    cluster : str or Client, optional
+        A Dask cluster whose workers render and differentiate the views of each step, of which there must be several: batch=N, one
+        or more for each worker. It is the scheduler's address or file, 'local:N' for N processes of this machine, or a client of
+        `distributed`. The result is that of one process up to rounding. If a worker dies, others do its views.
     note : dict, optional
         Further entries of metrics.json in the folder.
     options
@@ -93,7 +99,7 @@ def fit(
     ------
     InputError
         For an unknown method or option, a scan without signal or larger than memory, a folder that is in use or cannot be
-        written, a checkpoint of another fit, and a fit that diverges.
+        written, a checkpoint of another fit, a fit that diverges, and a cluster that does not answer or cannot do this fit.
     KeyboardInterrupt
         Between two steps after Ctrl-C; with a folder, its checkpoint is written.
 
@@ -101,7 +107,7 @@ def fit(
     --------
     `fit = lm.fit(data, lm.LINGO(), folder='out/foot')`
     """
-    ensure_variant()
+    variant = ensure_variant()
     require_type('scan', scan, (Scan, Dataset))
     require_type('method', method, (str, Method))
     require_type('live', live, bool)
@@ -110,6 +116,10 @@ def fit(
     if dataset.volume is None:  # else it is simulated, as a rule
         warn_of_intensities(dataset.train)
     chosen = method.changed(**options) if isinstance(method, Method) else method_of(method, **options)
+    if cluster is not None and chosen.batch == 1:
+        raise InputError(
+            'cluster= divides the views of a step among workers, and a step has 1 view: set batch=N, or leave it out'
+        )
     if resume and folder is None:
         raise InputError('resume=True needs the folder of the checkpoint to go on from: give folder=FOLDER')
     path = None if folder is None else result_folder(as_path('folder', folder), force=force, resume=resume)
@@ -122,6 +132,7 @@ def fit(
         checkpoint = None if path is None else path / CHECKPOINT
         watchers, few = watchers_of(dataset.train.geometry, live, log_dir, label), few_views(dataset)
         with (
+            nullcontext() if cluster is None else opened(cluster, None, variant=variant, bar=False) as workers,
             _reporting(chosen.iterations, progress) as report,
             watched(watchers, chosen.iterations) as watch,
             between_steps() as check,
@@ -138,7 +149,16 @@ def fit(
                 watch.snapshot(fit, numbers)
                 return numbers
 
-            result = run(dataset.train, chosen, seed, measure=measure, progress=between, path=checkpoint, resume=resume)
+            result = run(
+                dataset.train,
+                chosen,
+                seed,
+                measure=measure,
+                progress=between,
+                path=checkpoint,
+                resume=resume,
+                cluster=workers,
+            )
         result = result.with_data(dataset)
         if path is not None:
             if dataset.test is not None and (not isinstance(scan, Dataset) or scan.test is None):

@@ -72,6 +72,12 @@ def parser() -> Parser:
         metavar='D',
         help="write TensorBoard's events: numbers, slices, views (extra: tensorboard)",
     )
+    p.add_argument(
+        '--cluster',
+        metavar='ADDRESS|local:N',
+        help="divide the views of a step (-D batch=N) among the workers of a Dask cluster: its scheduler's address or file, or N "
+        'processes of this machine',
+    )
     p.add_argument('--resume', action='store_true', help='go on from the checkpoint in the output folder')
     p.add_argument('--force', action='store_true', help='replace an earlier result')
     p.add_argument('--seed', type=int, default=0, metavar='N', help='of every random choice (default: 0)')
@@ -147,6 +153,7 @@ def fit_scene(folder: Path, args: argparse.Namespace, method: Method, parameters
             title=Path(args.volume or args.projections or scene.name).name,
             live=args.live,
             log_dir=args.log_dir,
+            cluster=args.cluster,
             **units_of(args),
             note=dict(command=command_line(without=('--resume', '--force'))),
         )

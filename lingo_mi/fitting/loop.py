@@ -22,6 +22,7 @@ from lingo_mi.fitting.method import Method
 from lingo_mi.fitting.resume import identity, require_same_fit
 from lingo_mi.fitting.stopping import HeldOut
 from lingo_mi.fitting.view_order import view_order
+from lingo_mi.jobs.cluster import Cluster
 from lingo_mi.scan import Scan
 
 Measure = Callable[[Fit], dict]
@@ -39,6 +40,7 @@ def run(
     path: Path | None = None,
     resume: bool = False,
     at: Iterable[int] | None = None,
+    cluster: Cluster | None = None,
 ) -> Fit:
     """Fit a scan.
 
@@ -63,11 +65,13 @@ def run(
         the checkpoint's, if the method is `extensible`.
     at : iterable of int, optional
         Iterations to measure at, besides the last (default: `measure_at`).
+    cluster : Cluster, optional
+        Workers that do the views of each step.
 
     Raises
     ------
     InputError
-        For a scan that cannot be fitted, a checkpoint of another fit, and a fit that diverges.
+        For a scan that cannot be fitted, a checkpoint of another fit, a fit that diverges, and one that workers cannot do.
 
     Examples
     --------
@@ -81,11 +85,11 @@ def run(
     last, search = method.iterations, None  # a record
     if method.stopping.stop == 'on':
         if stored is None or stored.searching:
-            search, stored = _search(scan, method, wanted, seed, progress, path, stored), None
+            search, stored = _search(scan, method, wanted, seed, progress, path, stored, cluster), None
         else:
             search = stored.search or {}
         last = int(search['best'])
-    fit = Running(scan, scan, method, seed, stored, search)
+    fit = Running(scan, scan, method, seed, stored, search, cluster=cluster)
     marks = {*(measure_at(method.iterations) if at is None else at), last}
 
     def after() -> dict:
@@ -105,6 +109,7 @@ def _search(
     progress: Report | None,
     path: Path | None,
     stored: Checkpoint | None,
+    cluster: Cluster | None,
 ) -> dict:
     """The record of the search for the step to stop at: the loop on part of the views, until it predicts the others no better.
 
@@ -117,7 +122,7 @@ def _search(
     seen = judge.seen
     batch, stopping = min(wanted.batch, len(seen)), replace(wanted.stopping, stop='off')
     search_method = replace(wanted, batch=batch, stopping=stopping).bounded(seen)
-    fit = Running(scan, seen, method, seed, stored, judge.record, search_method)
+    fit = Running(scan, seen, method, seed, stored, judge.record, search_method, cluster)
 
     def after() -> dict:
         if judge.due(fit.iteration):
@@ -180,13 +185,17 @@ class Running:
         stored: Checkpoint | None,
         search: dict | None,
         method_seen: Method | None = None,
+        cluster: Cluster | None = None,
     ):
         """seen: the views of the scan that the steps see; method_seen: the method for these views, if it differs; search: a
-        record."""
+        record; cluster: its workers do the views."""
         self.geometry, self.identity, self.seen = scan.geometry, identity(scan), len(seen)
         self.method, self.seed, self.search = method, seed, search
         self.rng, self.average = np.random.default_rng(seed), Average(method.rates.average)
-        self.stepper = (method_seen or method).stepper(seen)
+        method_seen = method_seen or method
+        self.stepper = method_seen.stepper(seen)
+        if cluster is not None:
+            self.stepper.divide(cluster, method_seen)
         self.order: list[int] = []
         self.iteration, self.history, self._seconds = 0, [], 0.0
         self._losses = deque(maxlen=-(-len(seen) // self.stepper.method.batch))  # of the last pass over the views

@@ -22,6 +22,7 @@ from lingo_mi.fitting.options.stopping import Stopping
 from lingo_mi.fitting.state import State
 from lingo_mi.fitting.view_order import ORDERS
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.jobs.cluster import Cluster
 from lingo_mi.reconstruction.held_out import LEAST_VIEWS
 from lingo_mi.scan import Scan
 
@@ -254,6 +255,23 @@ class Stepper(ABC):
 
         `iteration` counts from 0. `rng` makes all random choices of the step.
         """
+
+    def divide(self, cluster: Cluster, method: Method) -> None:
+        """Let the workers of a cluster do the views of each step from now on.
+
+        Parameters
+        ----------
+        method : Method
+            Whose `stepper` this is.
+
+        Raises
+        ------
+        InputError
+            If the steps cannot be divided.
+        """
+        raise InputError(
+            f'cluster= divides the views of Gaussians among workers, not those of {method.name}: leave it out'
+        )
 
     def densified(self, state: DeviceState, iteration: int, rng: np.random.Generator) -> DeviceState | None:
         """The state after Gaussians were added or removed; None if that is not due at this iteration."""

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import drjit as dr
-import mitsuba as mi
 import numpy as np
 
 from lingo_mi.common.errors import InputError
@@ -15,14 +14,18 @@ from lingo_mi.fitting.corrections.correction import Correction
 from lingo_mi.fitting.densify import densify, reset_opacity
 from lingo_mi.fitting.device_state import DeviceState
 from lingo_mi.fitting.measured import trusted
-from lingo_mi.fitting.method import Stepper
+from lingo_mi.fitting.method import Method, Stepper
 from lingo_mi.fitting.methods.cloud_method import CloudMethod
 from lingo_mi.fitting.models.cloud import CloudModel
 from lingo_mi.fitting.options.loss import Loss
 from lingo_mi.fitting.state import State
 from lingo_mi.fitting.total_variation import random_cube_variation
+from lingo_mi.fitting.view_cluster import ViewsOfWorker, ViewsOnWorkers
 from lingo_mi.fitting.view_loss import MeasuredView, differentiate, differentiate_replayed, targets_of
+from lingo_mi.fitting.view_sums import ViewsHere, ViewSums
 from lingo_mi.geometry.base import Geometry
+from lingo_mi.jobs.actors import Actors
+from lingo_mi.jobs.cluster import Cluster
 from lingo_mi.projectors.backprop import leaves, pass_on
 from lingo_mi.scan import Scan
 
@@ -42,6 +45,8 @@ class GaussianStepper(Stepper):
         Corrections that are fitted with the cloud.
     share : Float or None
         Share of the second of two materials in every Gaussian.
+    views : ViewSums
+        What renders and differentiates the views.
     """
 
     method: CloudMethod
@@ -52,6 +57,7 @@ class GaussianStepper(Stepper):
         self.method = method.with_lengths(scan.geometry)
         self.forward, self.corrections, self.share = self.method.forward, corrections, None
         self.targets = targets_of(trusted(scan, method.effects), model.unit, method.loss.weights)
+        self.views: ViewSums = ViewsHere()
         # A fan beam does not determine the direction across its plane: nothing moves or turns out of the plane.
         self.flat = scan.geometry.grid.shape[2] == 1
         moving = any(correction.moves_views for correction in corrections)
@@ -70,25 +76,33 @@ class GaussianStepper(Stepper):
         gaussians = self.forward.gaussians(state.values)
         # Views and cube accumulate derivatives in these. Then one pass propagates them to the raw parameters.
         leaf = leaves(gaussians)
-        total, factors = mi.Float(0), []
-        for view in views:
-            target = self.targets[view]
-            for correction in self.corrections:
-                correction.before_view(self, target, view)
-            loss, norm, visible, factor = self._compare(leaf, target, len(views))
-            total += loss
-            factors.append(factor)
-            state.gradient += norm
-            state.visits += visible
-            for correction in self.corrections:
-                correction.after_view(self, target, view, iteration)
+        total, factor = self.views.add(self, leaf, state, views, len(views), iteration)
         loss = self.method.loss
         if isinstance(loss, Loss) and loss.lambda_tv > 0:
-            factor = sum(factors) if loss.loss_scale == 'dynamic' else None
             total += random_cube_variation(leaf, self.geometry, loss, self.method.extent, rng, factor)
         pass_on(gaussians, map(dr.grad, leaf))
         self._update(state, iteration)
         return total
+
+    def compare(self, leaf: tuple, target: MeasuredView, batch: int) -> Sequence:
+        """`differentiate` a view; replayed if the fit is of plain line integrals with known poses."""
+        if self.replays:
+            return differentiate_replayed(leaf, target, self.method.loss, self.forward, batch)
+        return differentiate(leaf, target, self.method.loss, self.forward, batch, self.model.signal, self.share)
+
+    def divide(self, cluster: Cluster, method: Method) -> None:
+        """See `Stepper.divide`; this process then keeps no views on its device."""
+        if self.corrections:
+            raise InputError(
+                'cluster= divides the views of a step among workers, which cannot fit poses, air levels, gains, scattered light '
+                'or two materials as well: leave it out, or those'
+            )
+        if any(address.startswith('inproc:') for address in cluster.client.nthreads()):
+            raise InputError(
+                'the workers of the cluster are threads of this process, which share one Dr.Jit: start processes'
+            )
+        workers = Actors(cluster, ViewsOfWorker(method, self.scan))
+        self.views, self.targets = ViewsOnWorkers(workers, tuple(self.forward.parameters)), []
 
     def densified(self, state: DeviceState, iteration: int, rng: np.random.Generator) -> DeviceState | None:
         """The state after densification and reset of opacities, whichever is due at this iteration; None if neither is.
@@ -131,12 +145,6 @@ class GaussianStepper(Stepper):
     def restore(self, arrays: dict[str, np.ndarray]) -> None:
         for correction in self.corrections:
             correction.restore(self, arrays)
-
-    def _compare(self, leaf: tuple, target: MeasuredView, batch: int) -> Sequence:
-        """`differentiate` a view; replayed if the fit is of plain line integrals with known poses."""
-        if self.replays:
-            return differentiate_replayed(leaf, target, self.method.loss, self.forward, batch)
-        return differentiate(leaf, target, self.method.loss, self.forward, batch, self.model.signal, self.share)
 
     def _update(self, state: DeviceState, iteration: int) -> None:
         """Move the parameters by Adam."""

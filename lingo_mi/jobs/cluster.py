@@ -30,7 +30,7 @@ TIMED_OUT = TimeoutError, asyncio.TimeoutError  # one class from Python 3.11 on
 
 @contextmanager
 def opened(
-    address: Any, folder: Path, threads: int = 0, variant: str | None = None, bar: bool = True
+    address: Any, folder: Path | None, threads: int = 0, variant: str | None = None, bar: bool = True
 ) -> Iterator[Cluster]:
     """A cluster, connected to; workers that were started here end with the block.
 
@@ -39,8 +39,8 @@ def opened(
     address : str or Client
         'tcp://HOST:PORT' of a scheduler, its file FILE.json, or 'local:N', N processes of this machine; or a client of
         `distributed`, which stays open.
-    folder : Path
-        An existing folder that all workers must see.
+    folder : Path or None
+        An existing folder that all workers must see; None: they need none.
     threads : int
         Dr.Jit's threads on a worker's CPU (0: all that a worker has; of local:N, its share).
     variant : str or None
@@ -55,7 +55,7 @@ def opened(
     """
     distributed = optional('distributed', 'cluster')
     if isinstance(address, distributed.Client):
-        yield Cluster(address, Path(folder).resolve(), threads, variant, bar)
+        yield Cluster(address, folder, threads, variant, bar)
         return
     if not isinstance(address, str | PathLike):
         raise InputError(f'cluster must be an address, local:N or a client of distributed, not {address!r}')
@@ -82,7 +82,7 @@ def opened(
             client = stack.enter_context(distributed.Client(**where, timeout='10s', set_as_default=False))
         except (OSError, ValueError, *TIMED_OUT) as error:  # ValueError: no address
             raise InputError(f'cluster={address}: no scheduler answers ({brief(error, 120)}); check it') from None
-        yield Cluster(client, Path(folder).resolve(), threads, variant, bar)
+        yield Cluster(client, folder, threads, variant, bar)
 
 
 @contextmanager
@@ -97,10 +97,11 @@ def workers(address: Any, path: Path) -> Iterator[Cluster]:
 class Cluster:
     """A `Runner` on the workers of a Dask client."""
 
-    def __init__(self, client: Any, folder: Path, threads: int, variant: str | None, bar: bool = True):
-        self.client, self.folder, self.threads, self.variant = client, str(folder), threads, variant
+    def __init__(self, client: Any, folder: Path | None, threads: int, variant: str | None, bar: bool = True):
+        self.client, self.threads, self.variant = client, threads, variant
+        self.folder = None if folder is None else str(Path(folder).resolve())
         self._bar = bar
-        self._require_workers()
+        self.require_workers()
 
     @property
     def dashboard(self) -> str:
@@ -150,7 +151,14 @@ class Cluster:
             if kind == 'stopped':
                 waiting.discard(name)
 
-    def _require_workers(self) -> None:
+    def require_workers(self) -> None:
+        """Wait for the first worker, and check all that are there.
+
+        Raises
+        ------
+        InputError
+            If none comes, or one cannot do the jobs.
+        """
         try:
             self.client.wait_for_workers(1, timeout=PATIENCE)
         except TIMED_OUT:

@@ -13,7 +13,7 @@ from lingo_mi.jobs.job import Event, Job, attempt
 PAUSE = 1.0  # seconds between two reports
 
 
-def describe_worker(folder: str, dask_worker: Any) -> dict:
+def describe_worker(folder: str | None, dask_worker: Any) -> dict:
     """Version, variants, threads for tasks, address of this worker, and whether it sees a folder; called by `Client.run`."""
     import mitsuba as mi
 
@@ -22,11 +22,11 @@ def describe_worker(folder: str, dask_worker: Any) -> dict:
         variants=mi.variants(),
         tasks=dask_worker.state.nthreads,
         address=dask_worker.address,
-        sees=Path(folder).is_dir(),
+        sees=folder is None or Path(folder).is_dir(),
     )
 
 
-def require_fit(worker: dict, folder: str, variant: str | None) -> None:
+def require_fit(worker: dict, folder: str | None, variant: str | None) -> None:
     """Raises InputError if a worker, by what `describe_worker` says, cannot do the jobs.
 
     Parameters
@@ -49,7 +49,7 @@ def require_fit(worker: dict, folder: str, variant: str | None) -> None:
         )
 
 
-def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str | None) -> Event:
+def work(job: Job, key: str, topic: str, folder: str | None, threads: int, variant: str | None) -> Event:
     """Run a job in a task of Dask; returns its last event.
 
     Parameters
@@ -58,8 +58,8 @@ def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str
         Key of the task.
     topic : str
         Topic of the events that it sends.
-    folder : str
-        A folder that all workers share.
+    folder : str or None
+        A folder that all workers share; None: none.
     threads : int
         Dr.Jit's threads on the CPU; 0: as many as it has.
     """
@@ -79,11 +79,7 @@ def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str
                 raise KeyboardInterrupt
 
     try:
-        require_fit(describe_worker(folder, worker), folder, variant)
-        try:
-            _prepare(threads, variant)
-        except InputError as error:
-            raise InputError(f'worker {worker.address}: {error}') from None
+        prepare(worker, folder, threads, variant)
         event = attempt(job, report, lambda event: worker.log_event(topic, event))
         return event._replace(value=f'{event.value} (worker {worker.address})') if event.kind == 'failed' else event
     except InputError as error:
@@ -91,6 +87,21 @@ def work(job: Job, key: str, topic: str, folder: str, threads: int, variant: str
     except KeyboardInterrupt:
         worker.log_event(topic, Event(job.name, 'stopped'))
         return Event(job.name, 'stopped')
+
+
+def prepare(worker: Any, folder: str | None, threads: int, variant: str | None) -> None:
+    """Check this worker, and choose its variant and its threads; arguments as of `work`.
+
+    Raises
+    ------
+    InputError
+        If it cannot do the jobs. The line names the worker.
+    """
+    require_fit(describe_worker(folder, worker), folder, variant)
+    try:
+        _prepare(threads, variant)
+    except InputError as error:
+        raise InputError(f'worker {worker.address}: {error}') from None
 
 
 def _prepare(threads: int, variant: str | None) -> None:

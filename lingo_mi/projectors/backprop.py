@@ -20,7 +20,7 @@ def pass_on(values: Iterable, gradients: Iterable, flags: Any = dr.ADFlag.Defaul
     """Backpropagate given gradients, one per value, to whatever the values were computed from."""
     for value, gradient in zip(values, gradients):
         if dr.grad_enabled(value):
-            dr.set_grad(value, gradient)
+            dr.accum_grad(value, gradient)  # a value may be an input itself, with the derivatives of other views
             dr.enqueue(dr.ADMode.Backward, value)
     dr.traverse(dr.ADMode.Backward, flags)
 

@@ -53,7 +53,7 @@ def kernels(function):
 
 
 def plain_view(self, gaussians, target, batch):
-    """`GaussianStepper._compare` with no code of an effect in it: footprints, splat, loss, derivatives."""
+    """`GaussianStepper.compare` with no code of an effect in it: footprints, splat, loss, derivatives."""
     s, extent, view = self.method.loss, self.method.extent, target.view
     cut = Cuts()
     footprints = project(gaussians, view, extent, cut=cut)
@@ -89,7 +89,7 @@ def test_absent_costs_nothing(monkeypatch, effects, changes):
     scan = replace(tiny_scan(geometry(3)), effects=effects)
     method = SHORT.changed(iterations=5, densify_from=100, **changes)
     launched = kernels(lambda: run(scan, method, seed=3))
-    monkeypatch.setattr(GaussianStepper, '_compare', plain_view)
+    monkeypatch.setattr(GaussianStepper, 'compare', plain_view)
     assert launched == kernels(lambda: run(scan, method, seed=3))
 
 
@@ -153,7 +153,7 @@ def test_derivatives_by_differences(name):
 
     def loss(values):
         state.values = values
-        return float(stepper._compare(leaves(stepper.forward.gaussians(state.values)), target, 1)[0][0])
+        return float(stepper.compare(leaves(stepper.forward.gaussians(state.values)), target, 1)[0][0])
 
     values = dict(state.values)
     for v in values.values():
@@ -161,7 +161,7 @@ def test_derivatives_by_differences(name):
     state.values = values
     gaussians = stepper.forward.gaussians(state.values)
     leaf = leaves(gaussians)
-    stepper._compare(leaf, target, 1)
+    stepper.compare(leaf, target, 1)
     pass_on(gaussians, map(dr.grad, leaf))
     rng = np.random.default_rng(1)
     for key, h in (('density', 2e-2), ('scale', 2e-2), ('centre', 4e-3)):
@@ -185,7 +185,7 @@ def test_derivatives_by_the_pose_through_bundles():
         stepper, state = stepper_of(Effects(None, FocalSpot((size, size), 2), None), rate_pose=(1e-3, 1e-4))
         target = stepper.targets[1]
         place(target.view, target.rays)
-        stepper._compare(leaves(stepper.forward.gaussians(state.values)), target, 1)
+        stepper.compare(leaves(stepper.forward.gaussians(state.values)), target, 1)
         slopes.append(gathered(target.view).ravel())
     np.testing.assert_allclose(slopes[1], slopes[0], rtol=1e-3, atol=1e-3 * np.abs(slopes[0]).max())
 

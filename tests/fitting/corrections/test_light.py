@@ -79,13 +79,13 @@ def test_the_light_is_a_constant_to_the_derivatives():
         dr.enable_grad(state.values['density'])
         gaussians = stepper.forward.gaussians(state.values)
         leaf = leaves(gaussians)
-        stepper._compare(leaf, target, 1)
+        stepper.compare(leaf, target, 1)
         pass_on(gaussians, map(dr.grad, leaf))
         results[lit] = dr.grad(state.values['density']).numpy()
 
     def loss(values):
         state.values['density'] = values
-        return float(stepper._compare(leaves(stepper.forward.gaussians(state.values)), target, 1)[0][0])
+        return float(stepper.compare(leaves(stepper.forward.gaussians(state.values)), target, 1)[0][0])
 
     way = mi.Float(np.abs(np.random.default_rng(1).normal(size=len(state))).astype(np.float32) * np.sign(results[True]))
     expected = (loss(plain + 0.02 * way) - loss(plain - 0.02 * way)) / 0.04

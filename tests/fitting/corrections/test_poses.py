@@ -51,7 +51,7 @@ def test_derivatives_by_differences(mode):
         frames = here.moved(Rotation.from_rotvec(move[:3]).as_matrix(), move[3:])
         place(target.view, frames)
         leaf = leaves(stepper.forward.gaussians(state.values))
-        return float(stepper._compare(leaf, target, 1)[0][0])
+        return float(stepper.compare(leaf, target, 1)[0][0])
 
     loss(np.zeros(6))
     poses = Poses(3)

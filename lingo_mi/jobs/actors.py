@@ -1,0 +1,114 @@
+"""An object that stays on the workers of a Dask cluster, and calls that are divided among them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from lingo_mi.common.errors import InputError, brief
+from lingo_mi.jobs.cluster import TIMED_OUT, Cluster
+from lingo_mi.jobs.worker import prepare
+
+ROUNDS = 4  # of one call: workers may die in all but the last
+
+
+class Actors:
+    """A copy of an object on each worker, which Dask calls an actor. It is made when a call needs it.
+
+    If a worker dies, others do its part of the call. A worker that comes later takes part from the next call on.
+
+    Parameters
+    ----------
+    cluster : Cluster
+        The workers.
+    thing
+        The object, which pickles.
+    """
+
+    def __init__(self, cluster: Cluster, thing: Any):
+        self._cluster, self._thing = cluster, thing
+        self._actors: dict[str, Any] = {}  # futures, by the worker's address
+
+    def divided(self, method: str, items: Sequence[Any], *arguments: Any) -> list[Any]:
+        """Call `thing.method(part, *arguments)` on several workers at once, each with a part of the items.
+
+        Returns
+        -------
+        list
+            The results. Every item was in the part of exactly one of them.
+
+        Raises
+        ------
+        InputError
+            If no worker comes, if one cannot do the work, and if workers die again and again. Other errors are the method's.
+        """
+        from distributed import CancelledError
+        from distributed.scheduler import KilledWorker
+
+        lost = OSError, RuntimeError, KilledWorker, CancelledError, *TIMED_OUT
+        results, left, reason = [], list(items), ''
+        with self._cluster.client.as_current():  # where actors look for their client
+            for _ in range(ROUNDS):
+                part_of, left = left, []
+                try:
+                    actors = self._ready(len(part_of))
+                except lost as error:
+                    left, reason = part_of, brief(error, 120)
+                    continue
+                parts = [(a, part_of[i :: len(actors)]) for i, a in enumerate(actors)]
+                calls = [(a, part, _called(actors[a], method, part, *arguments)) for a, part in parts]
+                for address, part, result in calls:
+                    try:
+                        results.append(result())
+                    except lost as error:
+                        left, reason = left + part, brief(error, 120)
+                        del self._actors[address]
+                if not left:
+                    return results
+        raise InputError(
+            f'workers of the cluster, or its scheduler, have gone ({reason}); start them, and go on with resume=True'
+        )
+
+    def _ready(self, count: int) -> dict[str, Any]:
+        """So many actors, or one for each worker if these are fewer, by address; those that lack are made."""
+        client = self._cluster.client
+        if not client.nthreads():
+            self._cluster.require_workers()
+        there = client.nthreads()
+        self._actors = {a: future for a, future in self._actors.items() if a in there and future.status == 'finished'}
+        chosen = sorted(there, key=lambda a: a not in self._actors)[:count]
+        if missing := [a for a in chosen if a not in self._actors]:
+            [thing] = client.scatter([self._thing], hash=False)
+            for a in missing:
+                arguments = thing, self._cluster.threads, self._cluster.variant
+                # Other workers: else it would wait for ever for one that has just died.
+                self._actors[a] = client.submit(_Actor, *arguments, workers=[a], allow_other_workers=True, actor=True)
+        return {a: self._actors[a].result() for a in chosen}
+
+
+def _called(actor: Any, *arguments: Any) -> Callable[[], Any]:
+    """A call that has begun, whose result waits for its end, and raises what went wrong."""
+    try:
+        return actor.call(*arguments).result
+    except RuntimeError as error:  # the actor has gone
+        reason = error
+
+    def fail():
+        raise reason
+
+    return fail
+
+
+class _Actor:
+    """The object on a worker, whose variant and threads are set before the first call."""
+
+    def __init__(self, thing: Any, threads: int, variant: str | None):
+        self._thing, self._threads, self._variant, self._prepared = thing, threads, variant, False
+
+    def call(self, method: str, part: Sequence[Any], *arguments: Any) -> Any:
+        if not self._prepared:  # here, since Dask calls an actor in another thread than it makes it
+            from distributed import get_worker
+
+            prepare(get_worker(), None, self._threads, self._variant)
+            self._prepared = True
+        return getattr(self._thing, method)(part, *arguments)
