@@ -61,8 +61,8 @@ def two_workers(monkeypatch):
 def require_close(found, wanted):
     """By Adam's first moments, which are sums of the steps' gradients.
 
-    Adam divides by the root of a mean square. So it moves by a whole step what has a gradient of rounding alone, such as the rotation
-    of a sphere.
+    Adam divides by the root of a mean square. So it moves by a whole step what has a gradient of rounding alone, such as the
+    rotation of a sphere.
     """
     for name, values in wanted.state.first.items():
         np.testing.assert_allclose(found.state.first[name], values, atol=1e-5 * np.abs(values).max(), err_msg=name)
