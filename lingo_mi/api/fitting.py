@@ -116,10 +116,8 @@ def fit(
     if dataset.volume is None:  # else it is simulated, as a rule
         warn_of_intensities(dataset.train)
     chosen = method.changed(**options) if isinstance(method, Method) else method_of(method, **options)
-    if cluster is not None and chosen.batch == 1:
-        raise InputError(
-            'cluster= divides the views of a step among workers, and a step has 1 view: set batch=N, or leave it out'
-        )
+    if cluster is not None:
+        chosen.require_batch()
     if resume and folder is None:
         raise InputError('resume=True needs the folder of the checkpoint to go on from: give folder=FOLDER')
     path = None if folder is None else result_folder(as_path('folder', folder), force=force, resume=resume)

@@ -106,6 +106,8 @@ def main() -> None:
     method = method_of_arguments(
         args, {k: v for k, v in defined.items() if k not in scene_parameters}, scene_parameters
     )
+    if args.cluster is not None:  # before the scan is simulated
+        method.require_batch()
     folder = result_folder(args.out or Path('out') / input_name(args), force=args.force, resume=args.resume)
     fit_scene(folder, args, method, {k: v for k, v in defined.items() if k in scene_parameters})
 

@@ -183,6 +183,13 @@ class Method(Part, ABC):
             raise InputError(f'stop=on holds views out, and {why}, or leave it out')
         return stop == 'on' or stop == 'auto' and not why and knows_noise(scan)
 
+    def require_batch(self) -> None:
+        """Raise InputError if a step has one view, which workers cannot divide."""
+        if self.batch == 1:
+            raise InputError(
+                'cluster= divides the views of a step among workers, and a step has 1 view: set batch=N, or leave it out'
+            )
+
     @property
     def frees_views(self) -> bool:
         """True if every view has a pose of its own to fit, so that no view can be predicted from others."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -27,7 +28,7 @@ class Actors:
 
     def __init__(self, cluster: Cluster, thing: Any):
         self._cluster, self._thing = cluster, thing
-        self._actors: dict[str, Any] = {}  # futures, by the worker's address
+        self._actors: dict[str, tuple[Any, Any]] = {}  # Dask's future, which keeps it alive, and the actor, by address
 
     def divided(self, method: str, items: Sequence[Any], *arguments: Any) -> list[Any]:
         """Call `thing.method(part, *arguments)` on several workers at once, each with a part of the items.
@@ -49,13 +50,13 @@ class Actors:
         results, left, reason = [], list(items), ''
         with self._cluster.client.as_current():  # where actors look for their client
             for _ in range(ROUNDS):
-                part_of, left = left, []
+                todo, left = left, []
                 try:
-                    actors = self._ready(len(part_of))
+                    actors = self._ready(len(todo))
                 except lost as error:
-                    left, reason = part_of, brief(error, 120)
+                    left, reason = todo, brief(error, 120)
                     continue
-                parts = [(a, part_of[i :: len(actors)]) for i, a in enumerate(actors)]
+                parts = [(a, todo[i :: len(actors)]) for i, a in enumerate(actors)]
                 calls = [(a, part, _called(actors[a], method, part, *arguments)) for a, part in parts]
                 for address, part, result in calls:
                     try:
@@ -71,19 +72,23 @@ class Actors:
 
     def _ready(self, count: int) -> dict[str, Any]:
         """So many actors, or one for each worker if these are fewer, by address; those that lack are made."""
+        from distributed.protocol.pickle import dumps
+
         client = self._cluster.client
         if not client.nthreads():
             self._cluster.require_workers()
         there = client.nthreads()
-        self._actors = {a: future for a, future in self._actors.items() if a in there and future.status == 'finished'}
+        self._actors = {a: kept for a, kept in self._actors.items() if a in there and kept[0].status == 'finished'}
         chosen = sorted(there, key=lambda a: a not in self._actors)[:count]
         if missing := [a for a in chosen if a not in self._actors]:
-            [thing] = client.scatter([self._thing], hash=False)
-            for a in missing:
-                arguments = thing, self._cluster.threads, self._cluster.variant
-                # Other workers: else it would wait for ever for one that has just died.
-                self._actors[a] = client.submit(_Actor, *arguments, workers=[a], allow_other_workers=True, actor=True)
-        return {a: self._actors[a].result() for a in chosen}
+            [thing] = client.scatter([dumps(self._thing)], hash=False)
+            arguments = thing, self._cluster.threads, self._cluster.variant
+            # Other workers: else it would wait for ever for one that has just died.
+            futures = {
+                a: client.submit(_Actor, *arguments, workers=[a], allow_other_workers=True, actor=True) for a in missing
+            }
+            self._actors |= {a: (future, future.result()) for a, future in futures.items()}
+        return {a: self._actors[a][1] for a in chosen}
 
 
 def _called(actor: Any, *arguments: Any) -> Callable[[], Any]:
@@ -102,13 +107,22 @@ def _called(actor: Any, *arguments: Any) -> Callable[[], Any]:
 class _Actor:
     """The object on a worker, whose variant and threads are set before the first call."""
 
-    def __init__(self, thing: Any, threads: int, variant: str | None):
-        self._thing, self._threads, self._variant, self._prepared = thing, threads, variant, False
+    def __init__(self, pickled: bytes, threads: int, variant: str | None):
+        self._given, self._thing = (pickled, threads, variant), None
 
     def call(self, method: str, part: Sequence[Any], *arguments: Any) -> Any:
-        if not self._prepared:  # here, since Dask calls an actor in another thread than it makes it
-            from distributed import get_worker
-
-            prepare(get_worker(), None, self._threads, self._variant)
-            self._prepared = True
+        if self._thing is None:  # made here, since Dask calls an actor in another thread than it makes it
+            self._thing = _prepared(*self._given)
+            self._given = ()
         return getattr(self._thing, method)(part, *arguments)
+
+
+def _prepared(pickled: bytes, threads: int, variant: str | None) -> Any:
+    from distributed import get_worker
+
+    worker = get_worker()
+    prepare(worker, None, threads, variant)
+    try:
+        return pickle.loads(pickled)
+    except ImportError as error:
+        raise InputError(f'worker {worker.address}: {error}; install it there, too') from None

@@ -119,8 +119,8 @@ def test_what_workers_cannot_do(scan, two_workers):
 
 @pytest.mark.thorough
 def test_a_worker_is_killed(scan, tmp_path):
-    """On real workers, one of which dies in the middle."""
-    method = SHORT.changed(batch=2, iterations=6)
+    """On real workers, one of which dies in the middle; and a start that they do not have."""
+    method = TWO.changed(start='masks', n_points=60, iterations=6)
     with dask_cluster(tmp_path, workers=2) as (address, processes):
         numbers = list(processes().values())
 
@@ -128,6 +128,8 @@ def test_a_worker_is_killed(scan, tmp_path):
             if done == 3:
                 os.kill(numbers[0], signal.SIGKILL)
 
-        found = lm.fit(scan, method, cluster=str(address), progress=kill)
+        with pytest.raises(InputError, match="^worker tcp://.*: No module named 'helpers'; install it there, too"):
+            lm.fit(scan, TWO, cluster=address, progress=False)
+        found = lm.fit(scan, method, cluster=address, progress=kill)
         assert len(processes()) == 1
         require_close(found, lm.fit(scan, method, progress=False))
