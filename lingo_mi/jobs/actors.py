@@ -108,12 +108,12 @@ class _Actor:
     """The object on a worker, whose variant and threads are set before the first call."""
 
     def __init__(self, pickled: bytes, threads: int, variant: str | None):
-        self._given, self._thing = (pickled, threads, variant), None
+        self._pickled, self._threads, self._variant, self._thing = pickled, threads, variant, None
 
     def call(self, method: str, part: Sequence[Any], *arguments: Any) -> Any:
         if self._thing is None:  # made here, since Dask calls an actor in another thread than it makes it
-            self._thing = _prepared(*self._given)
-            self._given = ()
+            self._thing = _prepared(self._pickled, self._threads, self._variant)
+            self._pickled = b''
         return getattr(self._thing, method)(part, *arguments)
 
 
