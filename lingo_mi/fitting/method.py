@@ -269,7 +269,7 @@ class Stepper(ABC):
         Parameters
         ----------
         method : Method
-            Whose `stepper` this is.
+            The method that made this stepper.
 
         Raises
         ------

@@ -35,7 +35,7 @@ class Sums:
     Parameters
     ----------
     gradients : dict[str, ndarray]
-        By the Gaussians' parameters, float32 [N, size].
+        Gradients by the Gaussians' parameters, float32 [N, size].
     statistic : ndarray
         Norms and visits, float32 [2, N].
     scalars : ndarray
@@ -57,9 +57,9 @@ class ViewsOfWorker:
     Parameters
     ----------
     method : Method
-        Of the fit.
+        The method of the fit.
     scan : Scan
-        All its views.
+        All views of the fit.
     """
 
     def __init__(self, method: Method, scan: Scan):
