@@ -9,6 +9,7 @@ import gzip
 import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -21,12 +22,22 @@ from lingo_mi.files.dicom import require_hounsfield, write_dicom
 from lingo_mi.files.units import PER_MM, Unit
 from lingo_mi.files.volumes import volume_header
 from lingo_mi.geometry.grid import Grid
-from lingo_mi.storage.file_access import new_folder, optional, replacing, writing
+from lingo_mi.storage.file_access import (
+    flush,
+    flush_folder,
+    new_folder,
+    optional,
+    replacing,
+    require_new_folder,
+    take_place,
+    writing,
+)
 
 NIFTI, ZARR, DICOM = ('.nii', '.nii.gz'), ('.ome.zarr', '.zarr'), '.dicom'
 THICKNESS = 64  # slices of a slab, unless the caller chooses
 AXES = 'z', 'y', 'x'
-HALVES = 'halves'  # folder of slabs at half the resolution, while workers fill a `shared_zarr`
+GROWING = 'growing.ome.zarr'  # a `shared_zarr` while workers fill it
+HALVES = 'halves'  # its folder of slabs at half the resolution
 CHUNK = 64  # voxels a side of an OME-Zarr's chunks, at most
 LEAST = 64  # voxels along the longest side of the coarsest level of a pyramid
 
@@ -121,19 +132,24 @@ def _write_zarr(path, grid, slabs, unit):
 def _new_zarr(folder: Path, grid: Grid, description: str) -> list[Any]:
     """The arrays of an OME-Zarr's levels, still empty, the finest first."""
     zarr, writer = optional('zarr', 'ome-zarr'), optional('ome_zarr.writer', 'ome-zarr')
-    shapes = [grid.shape[::-1]]
-    while max(shapes[-1]) > LEAST and min(shapes[-1]) > 1:
-        shapes.append(tuple(n // 2 for n in shapes[-1]))
     group = zarr.open_group(str(folder), mode='w', zarr_format=3)
     levels = [
         group.create_array(
             str(i), shape=s, chunks=tuple(min(n, CHUNK) for n in s), dtype='float32', dimension_names=AXES
         )
-        for i, s in enumerate(shapes)
+        for i, s in enumerate(_level_shapes(grid))
     ]
     _describe(writer, group, grid, len(levels))
     group.attrs['lingo_mi'] = description
     return levels
+
+
+def _level_shapes(grid: Grid) -> list[tuple[int, ...]]:
+    """The shapes [z, y, x] of an OME-Zarr's levels, the finest first."""
+    shapes = [grid.shape[::-1]]
+    while max(shapes[-1]) > LEAST and min(shapes[-1]) > 1:
+        shapes.append(tuple(n // 2 for n in shapes[-1]))
+    return shapes
 
 
 def require_whole_chunks(path: Path, thickness: int, unit: Unit = PER_MM) -> None:
@@ -148,30 +164,90 @@ def require_whole_chunks(path: Path, thickness: int, unit: Unit = PER_MM) -> Non
         )
 
 
-@contextmanager
-def shared_zarr(path: Path, grid: Grid, description: str = 'density per mm') -> Iterator[Path]:
-    """A new OME-Zarr that several processes fill by `write_chunks`, see `require_whole_chunks`.
+@dataclass(frozen=True)
+class SharedZarr:
+    """An OME-Zarr that several processes fill with slabs, see `shared_zarr`. It can be sent to workers.
 
-    Yields a temporary folder, which becomes `path` with its coarser levels when the block ends without an error.
+    Parameters
+    ----------
+    folder : Path
+        Of the OME-Zarr while it grows.
     """
-    with new_folder(path) as temporary:
-        levels, halves = _new_zarr(temporary, grid, description), temporary / HALVES
-        halves.mkdir()
-        yield temporary
-        half = (np.load(file) for file in sorted(halves.iterdir()))
+
+    folder: Path
+
+    def holds(self, begin: int) -> bool:
+        """Whether the slab that begins at this slice has been written."""
+        return self._half(begin).exists()
+
+    def write(self, begin: int, slab: np.ndarray) -> None:
+        """Write a slab [x, y, z] from the slice `begin` on, and its means for the next level.
+
+        Raises
+        ------
+        InputError
+            If the disk is full, or the file cannot be written for another reason.
+        """
+        end = begin + slab.shape[2]
+        with writing(self.folder):
+            array = optional('zarr', 'ome-zarr').open_group(str(self.folder), mode='r+')['0']
+            array[begin:end] = slab.transpose(2, 1, 0)
+            for k in range(begin // CHUNK, -(-end // CHUNK)):
+                chunks = self.folder / '0' / 'c' / str(k)
+                if chunks.exists():  # chunks of zeros have no file
+                    flush(chunks)
+            # The means come last, because they say that the slab is complete.
+            with replacing(self._half(begin)) as temporary, open(temporary, 'wb') as file:
+                np.save(file, _halved(slab.transpose(2, 1, 0)).transpose(2, 1, 0))
+
+    def _half(self, begin):
+        return self.folder / HALVES / f'{begin:08d}.npy'
+
+
+@contextmanager
+def shared_zarr(path: Path, grid: Grid, folder: Path, description: str = 'density per mm') -> Iterator[SharedZarr]:
+    """An OME-Zarr that several processes fill with slabs, see `require_whole_chunks`.
+
+    It grows in `folder`, and takes its place with its coarser levels when the block ends without an error. After an error it
+    stays, and the next call with the same folder continues it.
+
+    Parameters
+    ----------
+    path : Path
+        Of the OME-Zarr, a new folder.
+    grid : Grid
+        Grid of the whole volume.
+    folder : Path
+        On the disk of `path`. The caller makes sure that it belongs to this volume.
+    description : str
+        What the values are.
+
+    Raises
+    ------
+    InputError
+        If `path` exists, or cannot be written.
+    """
+    require_new_folder(path)
+    growing = folder / GROWING
+    halves = growing / HALVES
+    with writing(growing):
+        if not halves.is_dir():  # it is made last
+            shutil.rmtree(growing, ignore_errors=True)
+            growing.mkdir()
+            _new_zarr(growing, grid, description)
+            halves.mkdir()
+    yield SharedZarr(growing)
+    with writing(growing):
+        group = optional('zarr', 'ome-zarr').open_group(str(growing), mode='r+')
+        levels = [group[str(i)] for i in range(len(_level_shapes(grid)))]
+        half = (np.load(file) for file in sorted(halves.glob('[0-9]*.npy')))
         if len(levels) > 1:
             for begin, slab in _grouped(((0, slab) for slab in half), 2 ** (len(levels) - 2)):
                 _add(levels[1:], begin, slab.transpose(2, 1, 0))
+        flush(growing)
         shutil.rmtree(halves)
-
-
-def write_chunks(folder: Path, begin: int, slab: np.ndarray) -> None:
-    """Write a slab [x, y, z] from the slice `begin` on to a `shared_zarr`, and its means for the next level."""
-    with writing(folder):
-        array = optional('zarr', 'ome-zarr').open_group(str(folder), mode='r+')['0']
-        array[begin : begin + slab.shape[2]] = slab.transpose(2, 1, 0)
-        with replacing(folder / HALVES / f'{begin:08d}.npy') as temporary, open(temporary, 'wb') as file:
-            np.save(file, _halved(slab.transpose(2, 1, 0)).transpose(2, 1, 0))
+        take_place(growing, path)
+        flush_folder(path.parent)
 
 
 def _halved(slab: np.ndarray) -> np.ndarray:

@@ -2,40 +2,48 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
-from lingo_mi.files.slabs import shared_zarr, write_chunks
+import numpy as np
+
+from lingo_mi.files.slabs import SharedZarr, shared_zarr
 from lingo_mi.fitting.checkpoint import Checkpoint
 from lingo_mi.fitting.fitted_model import FittedModel
 from lingo_mi.geometry.grid import Grid
-from lingo_mi.jobs.job import Job, Runner, run_or_refuse
-from lingo_mi.storage.output_folder import CHECKPOINT
+from lingo_mi.jobs.job import Runner
+from lingo_mi.reconstruction.slab_cluster import claim, deliver_on, exchange_folder
+from lingo_mi.reconstruction.slab_volume import discard, work_folder
+from lingo_mi.storage.folder_lock import locked
 
 
 def voxelize_on(runner: Runner, fit: FittedModel, grid: Grid, thickness: int, path: Path) -> None:
-    """Write `fit.volume(grid)` as OME-Zarr, each slab by a worker, who reads the fit from a checkpoint beside it.
+    """Let workers write `fit.volume(grid)` as OME-Zarr. They read the fit from a checkpoint beside it.
+
+    If the work is stopped, the same call makes only those slabs that are missing.
 
     Raises
     ------
     InputError
-        If a slab fails twice, or the file cannot be written.
+        If a slab fails twice, the file cannot be written, or its folder holds slabs of other work.
     """
     fit.volume(grid.slab(0, 1))  # refuses, here, a method without a volume
-    with shared_zarr(path, grid) as target:
-        checkpoint = target / 'fit' / CHECKPOINT
-        checkpoint.parent.mkdir()
+    folder = work_folder(path)
+    with locked(folder), exchange_folder(folder) as exchange:
+        checkpoint = exchange / 'fit.npz'
         fit.checkpoint.save(checkpoint)
-        parts = enumerate(grid.slabs(thickness))
-        jobs = [Job(f'slab {k}', 1, voxelize_slab, (checkpoint, grid.slab(*p), p[0], target)) for k, p in parts]
-        run_or_refuse(jobs, runner)
-        shutil.rmtree(checkpoint.parent)
+        with np.load(checkpoint) as entries:
+            claim(folder, repr((str(entries['checksum']), grid, thickness)))
+        with shared_zarr(path, grid, folder) as target:
+            deliver_on(runner, grid.slabs(thickness), target, voxelize_slab, (checkpoint, grid))
+    discard(folder)
 
 
-def voxelize_slab(checkpoint: Path, slab: Grid, begin: int, target: Path, *, report: Callable[..., None]) -> None:
+def voxelize_slab(
+    target: SharedZarr, part: tuple[int, int], checkpoint: Path, grid: Grid, *, report: Callable[..., None]
+) -> None:
     """Write the density of a stored fit on the voxels of a slab to the OME-Zarr."""
     report(0)
     stored = Checkpoint.load(checkpoint)
     model = stored.method.model(stored.geometry, stored.unit, None)  # effects change no density
-    write_chunks(target, begin, FittedModel(stored, model).volume(slab))
+    target.write(part[0], FittedModel(stored, model).volume(grid.slab(*part)))

@@ -20,7 +20,7 @@ from lingo_mi.common.gpu import visible_gpus
 from lingo_mi.common.progress import Progress
 from lingo_mi.common.runtime import cores
 from lingo_mi.jobs.job import Event, Job, Tell
-from lingo_mi.jobs.worker import describe_worker, require_fit, work
+from lingo_mi.jobs.worker import describe_worker, require_fit, runs_job, work
 from lingo_mi.storage.file_access import optional
 
 PATIENCE = 60.0  # seconds: for the first worker, and for jobs that are told to stop
@@ -126,7 +126,7 @@ class Cluster:
                 raise InputError('the scheduler has gone; start one, and run the same command again')
             self.client.unsubscribe_topic(topic)
         except KeyboardInterrupt:
-            self._stop(futures, events)
+            self._stop(list(futures.values()), topic)
             raise
         except _gone() as error:
             raise InputError(
@@ -136,20 +136,13 @@ class Cluster:
             for future in futures.values():
                 future.release()
 
-    def _stop(self, futures: dict, events: queue.SimpleQueue) -> None:
-        """Tell all jobs to stop, and wait until those that run have stored what they have."""
-        running = {name for names in self.client.processing().values() for name in names}
-        waiting = {name for name, future in futures.items() if future.key in running}
+    def _stop(self, futures: list, topic: str) -> None:
+        """Tell all jobs to stop, and wait until no worker runs one any more: those that run store what they have."""
         print('\nstopping after a step of every job; Ctrl-C again to stop at once', file=sys.stderr)
-        self.client.cancel(list(futures.values()))
+        self.client.cancel(futures)
         ends = time.monotonic() + PATIENCE
-        while waiting and time.monotonic() < ends:
-            try:
-                name, kind, _ = events.get(timeout=0.2)
-            except queue.Empty:
-                continue
-            if kind == 'stopped':
-                waiting.discard(name)
+        while any(self.client.run(runs_job, topic, on_error='ignore').values()) and time.monotonic() < ends:
+            time.sleep(0.2)
 
     def require_workers(self) -> None:
         """Wait for the first worker, and check all that are there.

@@ -26,6 +26,11 @@ def describe_worker(folder: str | None, dask_worker: Any) -> dict:
     )
 
 
+def runs_job(topic: str, dask_worker: Any) -> bool:
+    """Whether this worker runs a job of a topic, cancelled ones included; called by `Client.run`."""
+    return any(str(task.key).startswith(topic) for task in dask_worker.state.executing)
+
+
 def require_fit(worker: dict, folder: str | None, variant: str | None) -> None:
     """Raises InputError if a worker, by what `describe_worker` says, cannot do the jobs.
 
@@ -85,7 +90,6 @@ def work(job: Job, key: str, topic: str, folder: str | None, threads: int, varia
     except InputError as error:
         return Event(job.name, 'failed', str(error))
     except KeyboardInterrupt:
-        worker.log_event(topic, Event(job.name, 'stopped'))
         return Event(job.name, 'stopped')
 
 

@@ -24,7 +24,7 @@ from lingo_mi.reconstruction.memory_needs import memory_needed
 from lingo_mi.reconstruction.preconditions import require_signal
 from lingo_mi.reconstruction.sart import Sweeps
 from lingo_mi.reconstruction.slab_cluster import fdk_on, sweep_on
-from lingo_mi.reconstruction.slab_volume import discard
+from lingo_mi.reconstruction.slab_volume import discard, work_folder
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
 
@@ -95,7 +95,7 @@ def run_in_slabs(
     """
     require_signal(scan)
     path = path.absolute()  # workers have other working directories
-    work = path.with_name(path.name + '.slabs')
+    work = work_folder(path)
     if isinstance(algorithm, FDK):
         if runner is not None:
             fdk_on(runner, algorithm, scan, thickness, work, path, progress)

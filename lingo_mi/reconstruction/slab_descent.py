@@ -106,7 +106,8 @@ class DescentPlan(SweepPlan):
         steps = Steps(volume.done, versions, len(volume.parts), progress)
         lengths = path_lengths(system, share, scan)
         if 'maxl2err' not in volume.numbers:
-            volume.numbers['maxl2err'] = self._maxl2err(system, share, scan)
+            # Before the first update: this writes filtered backprojection where the update will write.
+            volume.remember(maxl2err=self._maxl2err(system, share, scan))
         while volume.done < versions and not volume.numbers.get('ended'):
             k, step = divmod(volume.done, self._steps)
             if step < self._blocks:

@@ -1,4 +1,4 @@
-"""A volume in slabs on a disk, which updates read from one file and write to another, and how far its updates have come."""
+"""A volume in slabs on a disk: updates read it from one file and write it to another, and a state file counts them."""
 
 from __future__ import annotations
 
@@ -15,12 +15,15 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lingo_mi.common.errors import InputError
+from lingo_mi.files.slabs import GROWING
 from lingo_mi.geometry.grid import Grid
 from lingo_mi.storage.file_access import leftovers, read_json, reading, write_text, writing
 
 STATE = 'state.json'
 FILES = 'even.f32', 'odd.f32', 'third.f32', 'fourth.f32'
 PLANES = '.planes'  # ending of the file that holds the outer slices of the slabs of another one
+EXCHANGE = 'exchange'  # folder of what the workers of a cluster read and write besides the volume
+WORKERS = EXCHANGE, GROWING  # their folders
 
 
 class Places(NamedTuple):
@@ -141,27 +144,17 @@ class Volume(SlabFiles):
         super().__init__(grid, thickness, folder, place(0))
         self.done, self.numbers = 0, {}
         self._digest, self._place, self._names = digest, place, FILES[:files]
-        state, paths = folder / STATE, [folder / name for name in self._names]
+        paths = [folder / name for name in self._names]
         for path, _ in leftovers(folder):
             path.unlink()
-        if state.exists():
-            known = read_json(state)
-            try:
-                found, done, numbers = known['of'], int(known['updates']), dict(known.get('numbers', {}))
-            except (AttributeError, KeyError, TypeError, ValueError):
-                raise InputError(f'{state}: is not a state of ours; move its folder away') from None
-            if found != digest:
-                raise InputError(
-                    f'{folder}: holds a reconstruction of other data or with other options, which was stopped; '
-                    'remove the folder, or repeat that command to complete it'
-                )
-            needed = {place for place in self._place(done) if place is not None} - {self._place(done).to}
-            if done and all(paths[place].exists() for place in needed):  # else it was being discarded
-                self.done, self.numbers, self.places = done, numbers, self._place(done)
-        elif any(os.path.lexists(path) for path in paths):
+        if not (folder / STATE).exists() and any(os.path.lexists(path) for path in paths):
             raise InputError(
                 f'{folder}: has files named {" or ".join(self._names)} that are not ours; choose another folder'
             )
+        done, numbers = read_state(folder, digest)
+        read = {place for place in self._place(done) if place is not None} - {self._place(done).to}
+        if all(paths[place].exists() for place in read):  # else it was being discarded
+            self.done, self.numbers, self.places = done, numbers, self._place(done)
         self._require_room()
         self._record()
 
@@ -176,25 +169,68 @@ class Volume(SlabFiles):
             )
 
     def turn(self, **numbers: Any) -> None:
-        """The next version is complete: it becomes the one that is read. numbers: to remember from now on."""
+        """Make the next version, which is complete, the one that is read. numbers: as `remember` takes them."""
         self.flush()
-        self.done, self.numbers = self.done + 1, self.numbers | numbers
+        self.done += 1
         self.places = self._place(self.done)
+        self.remember(**numbers)
+
+    def remember(self, **numbers: Any) -> None:
+        """Keep some numbers with the state."""
+        self.numbers |= numbers
         self._record()
 
     def _record(self):
-        state = {'of': self._digest, 'updates': self.done} | ({'numbers': self.numbers} if self.numbers else {})
-        write_text(self.folder / STATE, json.dumps(state))
+        write_state(self.folder, self._digest, self.done, self.numbers)
+
+
+def work_folder(path: Path) -> Path:
+    """The folder beside a volume that holds it until it is complete."""
+    return path.with_name(path.name + '.slabs')
+
+
+def read_state(folder: Path, digest: str) -> tuple[int, dict[str, Any]]:
+    """How many versions of a volume the state file in a folder counts, and its numbers by name; (0, {}) without a file.
+
+    Parameters
+    ----------
+    digest : str
+        Of all that the result depends on.
+
+    Raises
+    ------
+    InputError
+        If the file is damaged, or of another reconstruction.
+    """
+    state = folder / STATE
+    if not state.exists():
+        return 0, {}
+    content = read_json(state)
+    try:
+        digest_there, done, numbers = content['of'], int(content['updates']), dict(content.get('numbers', {}))
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise InputError(f'{state}: is not a state of ours; move its folder away') from None
+    if digest_there != digest:
+        raise InputError(
+            f'{folder}: holds a reconstruction of other data or with other options, which was stopped; '
+            'remove the folder, or repeat that command to complete it'
+        )
+    return done, numbers
+
+
+def write_state(folder: Path, digest: str, done: int = 0, numbers: dict[str, Any] | None = None) -> None:
+    """Write the file that `read_state` reads."""
+    state = {'of': digest, 'updates': done} | ({'numbers': numbers} if numbers else {})
+    write_text(folder / STATE, json.dumps(state))
 
 
 def discard(folder: Path) -> None:
-    """Remove the files of a `Volume`, and their folder if nothing else lies there."""
+    """Remove the files of a `Volume` and of its workers, and their folder if nothing else lies there."""
+    for name in WORKERS:
+        shutil.rmtree(folder / name, ignore_errors=True)
     with writing(folder):
-        for name in (
-            *FILES,
-            *(name + PLANES for name in FILES),
-            STATE,
-        ):  # the state last: it says that the rest is ours
+        files = *FILES, *(name + PLANES for name in FILES)
+        for name in (*files, STATE):  # the state last: it says that the rest is ours
             (folder / name).unlink(missing_ok=True)
     with suppress(OSError):
         folder.rmdir()

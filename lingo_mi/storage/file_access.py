@@ -114,8 +114,8 @@ def _temporary(path, make, remove):
     try:
         make(temporary)
         yield temporary
-        _flush(temporary)
-        _take_place(temporary, path)
+        flush(temporary)
+        take_place(temporary, path)
         flush_folder(path.parent)
     except OSError as error:
         raise InputError(
@@ -129,7 +129,7 @@ def _temporary(path, make, remove):
 _WINDOWS = sys.platform == 'win32'
 
 
-def _take_place(temporary, path):
+def take_place(temporary: Path, path: Path) -> None:
     """Give a file or folder its name.
 
     Windows refuses a name that an empty folder has, and the name of a file while another program reads it.
@@ -157,11 +157,11 @@ def _remove_file(path):
         pass
 
 
-def _flush(path):
+def flush(path: Path) -> None:
     """Wait until a file, or all files in a folder, are on the disk: a name must never come before its content."""
     if path.is_dir():
         for part in path.iterdir():
-            _flush(part)
+            flush(part)
         flush_folder(path)
         return
     file = os.open(path, os.O_RDWR)
@@ -236,10 +236,15 @@ def new_folder(path: PathLike | str) -> Iterator[Path]:
         If `path` exists and is not an empty folder, or cannot be written.
     """
     path = Path(path)
-    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
-        raise InputError(f'{path}: exists already; remove it or give another name')
+    require_new_folder(path)
     with _temporary(path, Path.mkdir, lambda folder: shutil.rmtree(folder, ignore_errors=True)) as temporary:
         yield temporary
+
+
+def require_new_folder(path: Path) -> None:
+    """Raises InputError if `path` exists and is not an empty folder."""
+    if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+        raise InputError(f'{path}: exists already; remove it or give another name')
 
 
 def new_file(path: Path, force: bool) -> None:

@@ -1,23 +1,30 @@
 """Slabs on the workers of a Dask cluster: the volume of one process to the last bit, also where a worker is killed."""
 
+import errno
 import os
 import signal
 import threading
+import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 import lingo_mi as lm
+from helpers import slab_faults
 from helpers.dask_cluster import cluster, wait_until
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import read_scan, write_scan
+from lingo_mi.files.slabs import SharedZarr
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.files.zarr_views import ZarrViews
+from lingo_mi.fitting.slab_cluster import voxelize_on
 from lingo_mi.geometry import Grid
+from lingo_mi.jobs.cluster import Cluster
 from lingo_mi.jobs.in_process import InProcess
 from lingo_mi.reconstruction import ASDPOCS, FDK, OSSART, SART
 from lingo_mi.reconstruction.run import run_in_slabs
+from lingo_mi.storage.file_access import writing
 
 pytest.importorskip('distributed')
 zarr = pytest.importorskip('zarr')
@@ -89,18 +96,178 @@ def test_invalid_pixels(scan, tmp_path):
     require_same(tmp_path / 'many.ome.zarr', tmp_path / 'one.ome.zarr')
 
 
-def test_a_slab_that_fails(scan, tmp_path, monkeypatch):
-    """One line says which; nothing is written; the same call goes on."""
+STEPS = [
+    (FDK(), '_fdk_slab', ''),
+    (OSSART(niter=2, blocksize=4), '_slab_work', '2-update'),
+    (OSSART(niter=1, blocksize=9), '_deliver_slab', ''),
+    (ASDPOCS(niter=1, tviter=2, blocksize=5), '_slab_work', '0-update'),
+    (ASDPOCS(niter=1, tviter=2, blocksize=5), '_slab_work', '3-descend'),
+]
+
+
+@pytest.mark.parametrize('algorithm, function, step', STEPS, ids=[f'{a.name}{f}{s}' for a, f, s in STEPS])
+def test_a_full_disk(scan, tmp_path, monkeypatch, algorithm, function, step):
+    """One line says which slab and file; nothing is written. The same call makes only the slab of this step that is missing."""
     from lingo_mi.reconstruction import slab_cluster
 
-    how, out, work = OSSART(niter=2, blocksize=4), tmp_path / 'a.ome.zarr', tmp_path / 'a.ome.zarr.slabs'
-    monkeypatch.setattr(slab_cluster, 'write_chunks', lambda *_: (_ for _ in ()).throw(OSError('no room')))
-    with pytest.raises(InputError, match='slab 0: no room'):
-        run_in_slabs(scan, how, out, 64, runner=InProcess())
-    assert [p.name for p in tmp_path.iterdir()] == [work.name] and not (work / 'exchange').exists()
+    out, folder, made = tmp_path / 'a.ome.zarr', tmp_path / 'a.ome.zarr.slabs', []
+    number = {'_slab_work': lambda task, part: part}.get(function, lambda target, part: part[0] // 64)
+    make = getattr(slab_cluster, function)
+
+    def run(fails):
+        made.clear()
+
+        def job(first, part, *more, **options):
+            if getattr(first, 'step', '') == step:
+                if number(first, part) == 1 and fails:
+                    with writing(folder):
+                        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(folder / 'odd.f32'))
+                made.append(number(first, part))
+            make(first, part, *more, **options)
+
+        monkeypatch.setattr(slab_cluster, function, job)
+        run_in_slabs(scan, algorithm, out, 64, runner=InProcess())
+
+    with pytest.raises(InputError, match=r'^slab 1: .*odd.f32: cannot be written \(No space left') as error:
+        run(fails=True)
+    assert '\n' not in str(error.value) and [p.name for p in tmp_path.iterdir()] == [folder.name]
+    assert sorted(made) == [0, 2]
+    with pytest.raises(InputError, match='holds a reconstruction of other data or with other options'):
+        run_in_slabs(scan, replace(algorithm, **OTHER[algorithm.name]), out, 64, runner=InProcess())
+    run(fails=False)
+    assert made == [1] and [p.name for p in tmp_path.iterdir()] == [out.name]
+    run_in_slabs(scan, algorithm, tmp_path / 'wanted.ome.zarr', 64)
+    require_same(out, tmp_path / 'wanted.ome.zarr')
+
+
+OTHER = {'fdk': dict(filter='hann'), 'os-sart': dict(lmbda=0.5), 'asd-pocs': dict(alpha=0.1)}
+
+
+def test_a_volume_of_a_fit_that_was_stopped(scan, tmp_path, monkeypatch):
+    fit = lm.fit(scan, 'fast', iterations=2, n_points=50, progress=False)
+    out, write, made = tmp_path / 'a.ome.zarr', SharedZarr.write, []
+
+    def full(target, begin, slab):
+        if begin == 64:
+            raise InputError('no room')
+        made.append(begin)
+        write(target, begin, slab)
+
+    def save():
+        made.clear()
+        voxelize_on(InProcess(), fit, fit.geometry.grid, 64, out)
+
+    monkeypatch.setattr(SharedZarr, 'write', full)
+    with pytest.raises(InputError, match='slab 1: no room'):
+        save()
     monkeypatch.undo()
-    run_in_slabs(scan, how, out, 64, lambda *_: pytest.fail('computed again'), InProcess())
-    assert out.is_dir() and not work.exists()
+    monkeypatch.setattr(SharedZarr, 'write', lambda *a: made.append(a[1]) or write(*a))
+    save()
+    assert made == [64] and [p.name for p in tmp_path.iterdir()] == [out.name]
+    fit.save_volume(tmp_path / 'wanted.ome.zarr', slab=64)
+    require_same(out, tmp_path / 'wanted.ome.zarr')
+
+
+@pytest.fixture(scope='module')
+def client():
+    """Of two workers that are processes, which a nanny replaces when they die."""
+    import distributed
+
+    options = dict(n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0)
+    with distributed.LocalCluster(**options) as local, distributed.Client(local, set_as_default=False) as client:
+        yield client
+
+
+@pytest.fixture
+def workers(client):
+    """The client, whose workers are new again after the test."""
+    yield client
+    client.restart()
+
+
+@pytest.mark.thorough
+@pytest.mark.posix
+@pytest.mark.parametrize(
+    'algorithm, at',
+    [
+        pytest.param(OSSART(niter=2, blocksize=3), 3, id='os-sart'),
+        pytest.param(ASDPOCS(niter=2, tviter=3, blocksize=5), 2, id='asd-pocs, a sweep'),
+        pytest.param(ASDPOCS(niter=2, tviter=3, blocksize=5), 8, id='asd-pocs, a descent'),
+    ],
+)
+def test_a_worker_dies_in_a_slab(scan, tmp_path, workers, algorithm, at):
+    """It has written half of the slab. Another worker takes its place, and the volume is that of one process."""
+    run_in_slabs(scan, algorithm, tmp_path / 'one.ome.zarr', 64)
+    before = set(workers.run(os.getpid).values())
+    workers.run(slab_faults.die_in_slab, at, tmp_path / 'died')
+    lm.reconstruct(scan, algorithm, out=tmp_path / 'many.ome.zarr', cluster=workers, progress=False)
+    assert (tmp_path / 'died').exists()
+    require_same(tmp_path / 'many.ome.zarr', tmp_path / 'one.ome.zarr')
+    wait_until(lambda: len(workers.run(os.getpid)) == 2)
+    assert set(workers.run(os.getpid).values()) != before
+
+
+@pytest.mark.thorough
+@pytest.mark.posix
+@pytest.mark.parametrize(
+    'algorithm', [OSSART(niter=2, blocksize=3), ASDPOCS(niter=1, tviter=1, blocksize=5), FDK()], ids=lambda a: a.name
+)
+def test_interrupted(scan, tmp_path, workers, algorithm):
+    """After Ctrl-C no file is half written, and no worker has a task; the same call goes on."""
+    run_in_slabs(scan, algorithm, tmp_path / 'one.ome.zarr', 64)
+    workers.run(slab_faults.slow_slabs, 1.0, tmp_path / 'began')
+    home, began = tmp_path / 'home', time.monotonic()
+    home.mkdir()
+
+    def interrupt():
+        wait_until((tmp_path / 'began').exists)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    thread = threading.Thread(target=interrupt)
+    thread.start()
+    with pytest.raises(KeyboardInterrupt):
+        lm.reconstruct(scan, algorithm, out=home / 'many.ome.zarr', cluster=workers, progress=False)
+    thread.join()
+    assert time.monotonic() - began < 30  # it waits for the slabs that are being made, not for its patience to end
+    assert not any(workers.run(tasks_of_worker).values()) and not workers.run_on_scheduler(tasks_of_scheduler)
+    assert [p.name for p in home.iterdir()] == ['many.ome.zarr.slabs']
+    assert not list(home.rglob('.lingo_mi*'))
+    workers.restart()
+    lm.reconstruct(scan, algorithm, out=home / 'many.ome.zarr', cluster=workers, progress=False)
+    require_same(home / 'many.ome.zarr', tmp_path / 'one.ome.zarr')
+    assert [p.name for p in home.iterdir()] == ['many.ome.zarr']
+
+
+@pytest.mark.thorough
+@pytest.mark.posix
+def test_the_disk_of_the_workers_is_full(scan, tmp_path, workers):
+    """One line names the slab, the file and the worker. What other slabs have written stays."""
+    out, folder = tmp_path / 'many.ome.zarr', tmp_path / 'many.ome.zarr.slabs'
+    workers.run(slab_faults.full_disk, 64)
+    words = r'^slab 1: .*many.ome.zarr.slabs/growing.ome.zarr: cannot be written \(No space left.*\(worker tcp://'
+    with pytest.raises(InputError, match=words) as error:
+        lm.reconstruct(scan, FDK(), out=out, cluster=workers, progress=False)
+    assert '\n' not in str(error.value) and [p.name for p in tmp_path.iterdir()] == [folder.name]
+    halves = sorted((folder / 'growing.ome.zarr' / 'halves').iterdir())
+    assert [file.name for file in halves] == ['00000000.npy', '00000128.npy']
+    workers.restart()
+    again = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            Cluster, 'run', lambda self, jobs, tell, run=Cluster.run: again.extend(jobs) or run(self, jobs, tell)
+        )
+        lm.reconstruct(scan, FDK(), out=out, cluster=workers, progress=False)
+    assert [job.name for job in again] == ['slab 1']
+    run_in_slabs(scan, FDK(), tmp_path / 'one.ome.zarr', 64)
+    require_same(out, tmp_path / 'one.ome.zarr')
+
+
+def tasks_of_worker(dask_worker):
+    return len(dask_worker.state.executing)
+
+
+def tasks_of_scheduler(dask_scheduler):
+    return len(dask_scheduler.tasks)
 
 
 @pytest.mark.thorough
