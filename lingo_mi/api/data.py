@@ -138,10 +138,10 @@ def load(path: str | PathLike, geometry: str | PathLike | None = None, *, views:
     Parameters
     ----------
     path : path-like
-        A pickle of NAF, SAX-NeRF or X3D (read without running code), a folder of R2-Gaussian or of EXR images, `scan.npy` or
-        `scan.zarr` [view, v, u] with `scan.yml` beside it, or the .npz of a public scan.
+        A pickle of NAF, SAX-NeRF or X3D (read without running code), a folder of R2-Gaussian or of EXR images, `scan.npy`,
+        `scan.zarr` or `scan.h5` [view, v, u] with `scan.yml` beside it, or the .npz of a public scan.
     geometry : path-like or None
-        The geometry file of an .npy or .zarr (default: the .yml of the same name).
+        The geometry file of an .npy, .zarr or .h5 (default: the .yml of the same name).
     views : int or None
         How many of the views to fit, evenly spaced (default: all). The rest are held out, unless the file has held-out views.
 

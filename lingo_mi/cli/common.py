@@ -23,7 +23,7 @@ from lingo_mi.common.errors import InputError, brief, shown
 from lingo_mi.common.interrupts import noticed
 from lingo_mi.files.units import unit_of
 from lingo_mi.scene.shipped import scene_path, scenes
-from lingo_mi.storage.file_access import require_writable
+from lingo_mi.storage.file_access import require_new_folder, require_writable
 
 
 class Parser(argparse.ArgumentParser):
@@ -160,7 +160,7 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
         '--projections',
         metavar='F',
         help='measured projections: X3D/NAF pickle, R2 folder, HTC or walnut .npz, '
-        '.npy or .zarr with a geometry .yml beside it, or a folder of EXR images',
+        '.npy, .zarr or .h5 with a geometry .yml beside it, or a folder of EXR images',
     )
     parser.add_argument(
         '--volume',
@@ -276,18 +276,25 @@ def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: in
     return take_scan(scene, views or 0, volume, seed, truth=not slab)
 
 
-def check_scan_output(out: Path, inputs: Iterable[PathLike | str | None], force: bool) -> None:
-    """Raises InputError unless a scan can be written to `out`, an .npy, and beside it, over none of the files that are read.
+def check_scan_output(
+    out: Path, inputs: Iterable[PathLike | str | None], force: bool, endings: tuple[str, ...] = ('.npy',)
+) -> None:
+    """Raises InputError unless a scan can be written to `out` and beside it, over none of the files that are read.
 
     Parameters
     ----------
     force : bool
-        Whether other files may be overwritten.
+        Whether other files may be overwritten; a .zarr must be new.
+    endings : tuple of str
+        That the name may have.
     """
     from lingo_mi.files.scans import written_files
 
-    if out.suffix != '.npy':
-        raise InputError(f'{out}: a scan is written as .npy with a .yml beside it; give a name that ends in .npy')
+    if out.suffix not in endings:
+        kinds = ' or '.join(endings)
+        raise InputError(f'{out}: a scan is written as {kinds} with a .yml beside it; give a name that ends in {kinds}')
+    if out.suffix == '.zarr':
+        require_new_folder(out)
     written = written_files(out)
     for source in filter(None, inputs):
         if Path(source).resolve() in [file.resolve() for file in written]:

@@ -14,6 +14,8 @@ examples:
       NXtomo or DXchange, with its own flats, darks and angles
   lingo-mi import tiffs/ --geometry scan.xtekct --air 0 400 0 60 --out scan.npy
       Nikon, with the air level of every view from a region without object
+  lingo-mi import large.nxs --geometry scanner.yml --out scan.zarr
+      a few views at a time, for a scan that is larger than memory
   lingo-mi import dicom/ --out scan.npy
       DICOM-CT-PD, which says its geometry; frames of a C-arm need the air level, too
   lingo-mi fit scan.npy"""
@@ -37,8 +39,9 @@ def parser() -> Parser:
         '--out',
         required=True,
         type=Path,
-        metavar='F.npy',
-        help='the scan; F.yml is written beside it, F.valid.npy if pixels are not valid, and F.poses.npy for many poses',
+        metavar='F.npy|F.zarr',
+        help='the scan; F.yml is written beside it, F.valid.npy if pixels are not valid, and F.poses.npy for many poses. F.zarr '
+        'is written a few views at a time, and must be new',
     )
     add('--flats', metavar='F', help='frames without object')
     add('--darks', metavar='F', help='frames without beam')
@@ -97,7 +100,7 @@ def main() -> None:
     args = parser().parse_args()
     from lingo_mi.files.geometry_file import named_files
     from lingo_mi.files.scans import write_scan
-    from lingo_mi.raw.importing import import_raw
+    from lingo_mi.raw.importing import import_raw, import_to_zarr
     from lingo_mi.raw.nikon import read_numbers
     from lingo_mi.raw.options import Options
 
@@ -105,7 +108,7 @@ def main() -> None:
         raise InputError(f'--binning must be at least 1, not {args.binning}')
     named = named_files(args.geometry) if Path(args.geometry or '').suffix.lower() in ('.yml', '.yaml') else []
     inputs = [args.frames, args.geometry, args.flats, args.darks, args.angles, args.exposure, *named]
-    check_scan_output(args.out, inputs, args.force)
+    check_scan_output(args.out, inputs, args.force, ('.npy', '.zarr'))
     exposure = 1.0
     if args.exposure is not None:
         try:
@@ -117,13 +120,17 @@ def main() -> None:
         saturation=args.saturation, crop=args.crop, binning=args.binning, views=chosen_views(args.views), angles=args.angles,
         pixel=args.pixel, rings=args.rings, outliers=args.outliers,
     )  # fmt: skip
-    scan, history = import_raw(args.frames, args.geometry, options)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    write_scan(args.out, scan, 'npy', history)
-    left_out = 0.0 if scan.valid is None else 1 - scan.valid.mean()
+    if args.out.suffix == '.zarr':
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        imported = import_to_zarr(args.frames, args.geometry, options, args.out)
+    else:
+        scan, imported = import_raw(args.frames, args.geometry, options)
+        args.out.parent.mkdir(parents=True, exist_ok=True)
+        write_scan(args.out, scan, 'npy', imported.history)
+    history, (rows, columns) = imported.history, imported.geometry.nDetector
     photons = history.get('photons_from_flats', history['photons_from_views'])
-    print(f'{args.out}: {len(scan)} views of {scan.geometry.nDetector[0]} x {scan.geometry.nDetector[1]} pixels')
-    print(f'  {history["bad_pixels"]} bad pixels of the panel, {left_out:.2%} of all pixels left out')
+    print(f'{args.out}: {len(imported.geometry)} views of {rows} x {columns} pixels')
+    print(f'  {history["bad_pixels"]} bad pixels of the panel, {imported.left_out:.2%} of all pixels left out')
     if 'rings' in history:
         print(f'  rings: {history["rings"]:.3g} rms of line integrals subtracted, the same in all views')
     if 'darks' not in history and 'corrected_before' not in history:

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from lingo_mi.common.errors import InputError, shown
 from lingo_mi.files.geometry_file import geometry_file_of, named_files
+from lingo_mi.files.scans import ARRAYS
 from lingo_mi.fitting.method import Method
 from lingo_mi.fitting.methods.by_name import method_of
 from lingo_mi.scene import outline
@@ -136,14 +137,15 @@ def scene_of(folder: Path, geometry: str) -> Path | None:
 
 
 def _files(path, geometry):
-    """All files of a scan: the files of a folder, or the file. An .npy without another geometry also has its geometry file and
+    """All files of a scan: the files of a folder, or the file. An array without another geometry also has its geometry file and
     the files named there."""
+    files = [path]
     if path.is_dir():
-        return [file for file in path.rglob('*') if file.is_file() and file.name not in SYSTEM]
-    if path.suffix.lower() != '.npy' or geometry is not None:
-        return [path]
+        files = [file for file in path.rglob('*') if file.is_file() and file.name not in SYSTEM]
+    if path.suffix.lower() not in ARRAYS or geometry is not None:
+        return files
     beside = geometry_file_of(path)
-    return [path, beside, *named_files(beside)]
+    return [*files, beside, *named_files(beside)]
 
 
 def _digest(files):

@@ -21,6 +21,7 @@
                            dDetector is then a pixel's height and width along the arc, offDetector's second number a shift along
                            the arc; poses say where the panel's middle is, and u and v there
     valid                  name of a .npy beside this one, bool [n, v, u] or [v, u]: pixels to use. Others may hold anything
+    dataset                name of the dataset [n, v, u] in an HDF5 file (default: /exchange/data, of Data Exchange)
     history                how the projections were made, for people: `lingo-mi import` writes it
     input                  line_integral (default) or intensity, which needs I0, the unattenuated intensity
 
@@ -74,6 +75,7 @@ _KEYS = {
     'test_poses',
     'radius',
     'valid',
+    'dataset',
     'history',
     *MOTION,
 }
@@ -236,11 +238,20 @@ def geometry_file_of(path: Path, geometry: PathLike | str | None = None) -> Any:
     """
     if geometry is not None:
         return geometry
-    beside = [path.with_suffix(suffix) for suffix in ('.yml', '.yaml')]
-    file = next((p for p in beside if p.exists()), None)
-    if file is None:
-        raise InputError(f'{path}: needs its scan geometry; put it in {beside[0].name} beside it or name the file')
-    return file
+    if not has_geometry_file(path):
+        raise InputError(
+            f'{path}: needs its scan geometry; put it in {path.with_suffix(".yml").name} beside it or name the file'
+        )
+    return next(file for file in _beside(path) if file.exists())
+
+
+def has_geometry_file(path: Path) -> bool:
+    """Whether a geometry file lies beside an array."""
+    return any(file.exists() for file in _beside(path))
+
+
+def _beside(path):
+    return [path.with_suffix(suffix) for suffix in ('.yml', '.yaml')]
 
 
 def rows_run_up(values: dict, name: str = 'poses') -> bool:

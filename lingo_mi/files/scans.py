@@ -4,8 +4,8 @@ Besides the NAF pickle (`naf`) and the R2-Gaussian folder (`r2`):
 
 Projections with a geometry file (`geometry_file`): `scan.npy` [n, v, u] and `scan.yml`.
 
-Projections in chunks: `scan.zarr`, a Zarr array [n, v, u], and `scan.yml` as above. Work on slabs reads the views that it
-needs, and all other work reads all views.
+Projections in chunks: `scan.zarr`, a Zarr array [n, v, u], or a dataset [n, v, u] of `scan.h5`, and `scan.yml` as above. Work on
+slabs reads the views that it needs, and all other work reads all views.
 
 A folder of EXR images: `geometry.yml` as above (with `test_angles` or `test_poses` if there are held-out views),
 `train/0000.exr` …, `test/0000.exr` …, each one view, and `volume.nii.gz` if the true volume is known.
@@ -15,8 +15,9 @@ Public measured scans as .npz: see `lingo_mi.files.public_scans`.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -24,7 +25,7 @@ from typing import Any
 
 import numpy as np
 
-from lingo_mi.common.errors import InputError
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.common.memory import require_room
 from lingo_mi.files import arrays, naf, public_scans, r2
 from lingo_mi.files.geometry_file import (
@@ -32,6 +33,7 @@ from lingo_mi.files.geometry_file import (
     dump_geometry,
     flat_panel,
     geometry_file_of,
+    has_geometry_file,
     line_integrals,
     load_yaml,
     on_circle,
@@ -39,37 +41,45 @@ from lingo_mi.files.geometry_file import (
     rows_run_up,
     valid_mask,
 )
+from lingo_mi.files.hdf5_views import SUFFIXES, hdf5_views
 from lingo_mi.files.images import read_exr, write_exr
 from lingo_mi.files.scanner_dict import make_dataset, make_scan, require_same_scanner
 from lingo_mi.files.slices import by_number
 from lingo_mi.files.volumes import read_volume, write_volume
-from lingo_mi.files.zarr_views import write_zarr_views, zarr_views
-from lingo_mi.geometry import astra
+from lingo_mi.files.zarr_views import VIEWS, new_zarr_views, zarr_views
+from lingo_mi.geometry import Geometry, astra
 from lingo_mi.scan import Dataset, Scan
-from lingo_mi.storage.file_access import new_folder, reading, replacing
+from lingo_mi.storage.file_access import new_folder, reading, replacing, take_place
 
 MOST_LISTED = 1000  # poses in a geometry file
 FRAMES = {  # raw ones
     *('.tif', '.tiff', '.edf', '.png', '.jp2', '.j2k', '.jpx', '.his', '.hnd', '.hnc', '.xim'),
-    *('.h5', '.hdf5', '.hdf', '.nxs', '.nx', '.dcm', '.ima', '.txrm', '.xrm'),
+    *(*SUFFIXES, '.dcm', '.ima', '.txrm', '.xrm'),
 }
-ARRAYS = '.npy', '.zarr'  # projections with a geometry file
+ARRAYS = '.npy', '.zarr', *SUFFIXES  # projections with a geometry file
 VALID, POSES = '.valid.npy', '.poses.npy'  # endings of the files beside an .npy
 
 
 # ---- arrays ------------------------------------------------------------------------------------------------
 
 
-def _read_zarr(path, geometry):
+def _read_stored(path, geometry):
+    """Projections that are read where they are needed, in a .zarr or an HDF5 file."""
     values = array_values(geometry)
     if values.get('input', 'line_integral') != 'line_integral':
         raise InputError(
-            f'{geometry}: projections in a .zarr are line integrals: leave out input, and take the logarithm'
+            f'{geometry}: projections in a {path.suffix} are line integrals: leave out input, and take the logarithm'
         )
-    views = zarr_views(path, rows_run_up(values))
+    dataset, flipped = values.get('dataset'), rows_run_up(values)
+    if path.suffix.lower() == '.zarr':
+        views = zarr_views(path, flipped)
+    elif dataset is None or isinstance(dataset, str):
+        views = hdf5_views(path, dataset, flipped)
+    else:
+        raise InputError(f'{geometry}: dataset must be the name of a dataset, not {shown(dataset)}')
     valid = valid_mask(values, views.shape, geometry)
     if valid is not None:
-        valid = valid[:, ::-1] if views.rows_run_up else valid
+        valid = valid[:, ::-1] if flipped else valid
     return Dataset(make_scan(posed_geometry(values, len(views.numbers), geometry), views, path, valid))
 
 
@@ -86,48 +96,118 @@ def _read_npy(path, geometry):
 
 
 def written_files(path: Path) -> list[Path]:
-    """All files that a scan `path`, an .npy, may be written to."""
+    """All files that a scan `path`, an .npy or .zarr, may be written to."""
     return [path, path.with_suffix('.yml'), *(path.with_name(path.stem + ending) for ending in (VALID, POSES))]
 
 
-def _write_zarr(path, dataset):
-    path, scan = Path(path), dataset.train
+@dataclass
+class ChunkedScan:
+    """A scan in a .zarr while it is written, see `new_zarr_scan`.
+
+    Attributes
+    ----------
+    projections : zarr.Array
+        Line integrals float32 [n, v, u], fastest to write by `VIEWS` views.
+    valid : ndarray
+        Bool [n, v, u], in a file; at first, no pixel is valid.
+    history : dict or None
+        How the scan was made.
+    """
+
+    projections: Any
+    valid: np.ndarray
+    history: dict | None = None
+
+
+@contextmanager
+def new_zarr_scan(path: Path, geometry: Geometry) -> Iterator[ChunkedScan]:
+    """A scan in chunks, with its geometry, mask and poses beside it, to be filled a few views at a time.
+
+    All files take their places when the block ends without an error.
+
+    Parameters
+    ----------
+    path : Path
+        A new folder, .zarr.
+    geometry : Geometry
+        Of all views.
+
+    Raises
+    ------
+    InputError
+        If `path` exists, has another ending, or cannot be written.
+
+    Examples
+    --------
+    >>> with new_zarr_scan(Path('scan.zarr'), geometry) as scan:
+    ...     scan.projections[:4], scan.valid[:4] = first_views, True
+    """
     if path.suffix != '.zarr':
         raise InputError(f'{path}: give projections in chunks a name that ends in .zarr')
+    shape, more = (len(geometry), *geometry.nDetector), {}
+    with ExitStack() as files:
+        folder = files.enter_context(new_folder(path))
+        array = new_zarr_views(folder, shape)
+        mask = np.lib.format.open_memmap(folder / VALID, 'w+', bool, shape)  # here while nobody knows if it is needed
+        scan = ChunkedScan(array, mask)
+        yield scan
+        all_valid = all(view.all() for view in mask)
+        mask.flush()
+        scan.valid, mask = np.zeros(shape[:0], bool), None  # closes the file, for Windows
+        if all_valid:
+            (folder / VALID).unlink()
+        else:
+            more['valid'] = path.stem + VALID
+            take_place(folder / VALID, files.enter_context(replacing(path.with_name(more['valid']))))
+        _put_geometry(files, path, geometry, scan.history, more)
+
+
+def _put_geometry(files, path, geometry, history, more):
+    """The geometry file of an array, and the file of its poses, as part of a stack of files."""
+    if history is not None:
+        more['history'] = history
+    if len(geometry) > MOST_LISTED and not on_circle(geometry):
+        more['poses'] = path.stem + POSES
+        poses = astra.to_vectors(flat_panel(geometry).rays(), geometry.nDetector)
+        arrays.write_npy_in_place(files.enter_context(replacing(path.with_name(more['poses']))), poses)
+    file = files.enter_context(replacing(path.with_suffix('.yml')))
+    dump_geometry(file, geometry, input='line_integral', **more)
+
+
+def _require_training_views(path, dataset):
     if dataset.test is not None or dataset.volume is not None:
-        raise InputError(f'{path}: a .zarr holds the training views alone; drop the test views and the volume')
-    with replacing(path.with_suffix('.yml')) as file:
-        dump_geometry(file, scan.geometry)
-        write_zarr_views(path, scan.projections)
+        raise InputError(
+            f"{path}: a {path.suffix} holds the training views alone; write 'naf', 'r2' or 'exr' instead, or drop the test "
+            'views and the volume'
+        )
+
+
+def _write_zarr(path, dataset, history=None):
+    path, scan = Path(path), dataset.train
+    _require_training_views(path, dataset)
+    with new_zarr_scan(path, scan.geometry) as new:
+        new.history = history
+        for first in range(0, len(scan), VIEWS):
+            some = slice(first, first + VIEWS)
+            new.projections[some] = scan.views(some)
+            new.valid[some] = True if scan.valid is None else scan.valid[some]
 
 
 def _write_npy(path, dataset, history=None):
-    path = Path(path)
+    path, scan = Path(path), dataset.train
     if path.suffix != '.npy':
         raise InputError(
             f'{path}: projections are written as .npy with a .yml beside it; give a name that ends in .npy'
         )
-    if dataset.test is not None or dataset.volume is not None:
-        raise InputError(
-            f"{path}: an .npy file holds the training views alone; write 'naf', 'r2' or 'exr' "
-            'instead, or drop the test views and the volume'
-        )
-    more: dict = {'input': 'line_integral'}
-    if history is not None:
-        more['history'] = history
-    content = {path: dataset.train.projections}
-    if dataset.train.valid is not None:
-        more['valid'] = path.stem + VALID
-        content[path.with_name(more['valid'])] = dataset.train.valid
-    geometry = dataset.train.geometry
-    if len(geometry) > MOST_LISTED and not on_circle(geometry):
-        more['poses'] = path.stem + POSES
-        content[path.with_name(more['poses'])] = astra.to_vectors(flat_panel(geometry).rays(), geometry.nDetector)
+    _require_training_views(path, dataset)
+    more = {}
     # An earlier scan stays whole until all of the new one is on the disk.
     with ExitStack() as files:
-        for file, values in content.items():
-            arrays.write_npy_in_place(files.enter_context(replacing(file)), values)
-        dump_geometry(files.enter_context(replacing(path.with_suffix('.yml'))), geometry, **more)
+        arrays.write_npy_in_place(files.enter_context(replacing(path)), scan.projections)
+        if scan.valid is not None:
+            more['valid'] = path.stem + VALID
+            arrays.write_npy_in_place(files.enter_context(replacing(path.with_name(more['valid']))), scan.valid)
+        _put_geometry(files, path, scan.geometry, history, more)
 
 
 # ---- EXR folders -------------------------------------------------------------------------------------------
@@ -199,10 +279,10 @@ def read_scan(path: PathLike | str, geometry: PathLike | str | None = None, name
     Parameters
     ----------
     path : path-like
-        .pickle, .pkl: NAF / SAX-NeRF (X3D); .npy, or a folder .zarr: projections with a geometry file; .npz: a public scan
-        (`public_scans`); a folder with meta_data.json (R2-Gaussian) or with geometry.yml (EXR views).
+        .pickle, .pkl: NAF / SAX-NeRF (X3D); .npy, .h5 (`hdf5_views`) or a folder .zarr: projections with a geometry file; .npz: a
+        public scan (`public_scans`); a folder with meta_data.json (R2-Gaussian) or with geometry.yml (EXR views).
     geometry : path-like or None
-        The geometry file of an .npy or .zarr; without it, the .yml or .yaml of the same stem.
+        The geometry file of an .npy, .zarr or .h5; without it, the .yml or .yaml of the same stem.
     name : str
         Which sinogram of the Helsinki Tomography Challenge.
 
@@ -232,10 +312,10 @@ def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name
     suffix = path.suffix.lower()
     if geometry is not None and suffix not in ARRAYS:
         raise InputError(
-            f'{path}: carries its own geometry; a geometry file goes with projections in .npy or .zarr only'
+            f'{path}: carries its own geometry; a geometry file goes with projections in .npy, .zarr or .h5 only'
         )
     if suffix == '.zarr' and path.is_dir():
-        return partial(_read_zarr, path, geometry_file_of(path, geometry))
+        return partial(_read_stored, path, geometry_file_of(path, geometry))
     if path.is_dir():
         if (path / r2.META).exists():
             return partial(r2.read_r2, path)
@@ -255,6 +335,8 @@ def reader_of(path: PathLike | str, geometry: PathLike | str | None = None, name
         return partial(_read_npy, path, geometry_file_of(path, geometry))
     if suffix == '.npz':
         return partial(public_scans.read_public_scan, path, name)
+    if suffix in SUFFIXES and (geometry is not None or has_geometry_file(path)):
+        return partial(_read_stored, path, geometry_file_of(path, geometry))
     if suffix in FRAMES:
         raise _raw_frames(path)
     raise InputError(f'{path}: is not a known scan format; give .pickle, .npy, .npz, or a folder of a scan')
@@ -266,6 +348,7 @@ def _raw_frames(path):
     )
 
 
+ARRAY_KINDS = 'npy', 'zarr'  # whose geometry file holds a mask and a history
 _WRITERS = {'naf': naf.write_naf, 'r2': r2.write_r2, 'exr': _write_exr_folder, 'npy': _write_npy, 'zarr': _write_zarr}
 
 
@@ -288,10 +371,9 @@ def write_scan(path: PathLike | str, dataset: Dataset | Scan, kind: str, history
     ----------
     kind : str
         'naf': a pickle; 'r2': a new R2-Gaussian folder; 'exr': a new folder of EXR views; 'npy': `path` and its .yml, for
-        training views alone, and the mask of valid pixels if there is one; 'zarr': a new folder in chunks, and its .yml, for
-        training views alone.
+        training views alone, and the mask of valid pixels if there is one; 'zarr': the same with a new folder in chunks.
     history : dict or None
-        How it was made, plain values by name; for 'npy'.
+        How it was made, plain values by name; for 'npy' and 'zarr'.
 
     Raises
     ------
@@ -302,11 +384,10 @@ def write_scan(path: PathLike | str, dataset: Dataset | Scan, kind: str, history
         raise InputError(f'{kind!r} is not a kind of scan file; choose one of {", ".join(_WRITERS)}')
     dataset = Dataset(dataset) if isinstance(dataset, Scan) else dataset
     masked = any(scan is not None and scan.valid is not None for scan in (dataset.train, dataset.test))
-    if masked and kind != 'npy':
-        raise InputError(f"{path}: this format holds no mask of valid pixels; write 'npy'")
-    if history is not None:
-        if kind != 'npy':
-            raise InputError(f"{path}: this format holds no history; write 'npy'")
-        _write_npy(path, dataset, history)
+    if kind in ARRAY_KINDS:
+        _WRITERS[kind](path, dataset, history)
         return
+    if masked or history is not None:
+        what = 'mask of valid pixels' if masked else 'history'
+        raise InputError(f"{path}: this format holds no {what}; write 'npy' or 'zarr'")
     _WRITERS[kind](path, dataset)

@@ -2,118 +2,97 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from itertools import product
+from collections.abc import Iterable
+from math import prod
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from lingo_mi.common.errors import InputError, brief
+from lingo_mi.common.memory import require_room
 from lingo_mi.files.ome_zarr import require_codecs
-from lingo_mi.geometry.rays import Index
-from lingo_mi.scan import StoredViews
-from lingo_mi.storage.file_access import new_folder, optional, reading
+from lingo_mi.files.stored_views import FileViews, require_projections, span
+from lingo_mi.storage.file_access import optional, reading
 
 VIEWS = 4  # of a chunk that is written
 
 
-@dataclass(frozen=True, eq=False)
-class ZarrViews(StoredViews):
-    """Views of a Zarr array [n, v, u]; a process that has this object finds the file by its path.
+class ZarrViews(FileViews):
+    """Views of a Zarr array [n, v, u], see `FileViews`."""
 
-    Parameters
-    ----------
-    path : Path
-        Folder of the array.
-    shape : tuple of int
-        Shape of the projections.
-    numbers : ndarray
-        Numbers of the views in the file.
-    rows_run_up : bool
-        Whether the rows of the file run up.
-    """
-
-    path: Path
-    shape: tuple[int, int, int]
-    numbers: np.ndarray
-    rows_run_up: bool = False
-
-    def __repr__(self) -> str:
-        return f'{self.path}{list(self.shape)}'
-
-    def __getitem__(self, index: Index) -> np.ndarray:
-        """Line integrals of some views, float32 [view, v, u].
-
-        Raises
-        ------
-        InputError
-            If the file lacks a chunk of them, or a chunk cannot be unpacked or holds NaN. The message names the file.
-        """
-        numbers, array = self.numbers[index], _opened(self.path)
-        _require_chunks(self.path, array, numbers)
+    def _read(self, numbers: np.ndarray) -> np.ndarray:
+        array = _opened(self.path)
+        _require_chunks(self.path, array, np.unique(numbers // int(array.chunks[0])))
         try:
             with reading(self.path, folder=True):
-                found = np.asarray(array.oindex[numbers], np.float32)
+                return array.oindex[numbers]
         except InputError:
             raise
         except Exception as error:  # of codecs: many kinds
             raise InputError(
-                f'{self.path}: a chunk of the views {_span(numbers)} is cut off or damaged ({brief(error, 80)}); write it again'
+                f'{self.path}: a chunk of the views {span(numbers)} is cut off or damaged ({brief(error, 80)}); write it again'
             ) from None
-        bad = ~np.isfinite(found).all((1, 2))
-        if bad.any():
-            raise InputError(
-                f'{self.path}: view {numbers[bad][0]} holds NaN or infinity; repair or leave out its pixels'
-            )
-        return found[:, ::-1] if self.rows_run_up else found
-
-    def subset(self, index: Index) -> ZarrViews:
-        numbers = self.numbers[index]
-        return replace(self, numbers=numbers, shape=(len(numbers), *self.shape[1:]))
 
 
 def zarr_views(path: Path, rows_run_up: bool = False) -> ZarrViews:
     """The projections of a Zarr array, none of which are read yet.
 
+    Parameters
+    ----------
+    path : Path
+        Folder of the array.
+    rows_run_up : bool
+        Whether the rows of the array run up.
+
     Raises
     ------
     InputError
         If it is damaged, lacks chunks, or is not an array of real numbers [n, v, u].
+
+    Examples
+    --------
+    >>> zarr_views(Path('scan.zarr'))[:4]
     """
     path = path.absolute()  # workers have other working directories
     array = _opened(path)
-    shape, dtype = tuple(int(n) for n in array.shape), np.dtype(array.dtype)
-    if len(shape) != 3 or min(shape) < 1 or dtype.kind not in 'uif':
-        raise InputError(f'{path}: holds {dtype} values of the shape {list(shape)}; real numbers [n, v, u] are needed')
+    shape = require_projections(path, tuple(int(n) for n in array.shape), np.dtype(array.dtype))
     if getattr(array, 'shards', None):
         raise InputError(f'{path}: keeps several chunks in a file (shards); write it with chunks alone')
-    numbers = np.arange(shape[0])
-    _require_chunks(path, array, numbers)
-    return ZarrViews(path, shape, numbers, rows_run_up)
+    require_room(prod(int(n) for n in array.chunks) * np.dtype(array.dtype).itemsize, path)
+    _require_chunks(path, array, range(-(-shape[0] // int(array.chunks[0]))))
+    return ZarrViews(path, shape, np.arange(shape[0]), rows_run_up)
 
 
-def write_zarr_views(path: Path, projections: np.ndarray) -> None:
-    """Write projections as a new Zarr array, `VIEWS` views a chunk.
+def new_zarr_views(folder: Path, shape: tuple[int, int, int]) -> Any:
+    """A new Zarr array of projections in an empty folder, `VIEWS` views a chunk, to be filled by chunks.
+
+    Parameters
+    ----------
+    folder : Path
+        Of the array.
+    shape : tuple of int
+        Of the projections [n, v, u].
+
+    Returns
+    -------
+    zarr.Array
+        Float32.
 
     Raises
     ------
     InputError
-        If `path` exists, or cannot be written.
+        If zarr is not installed.
     """
-    zarr = optional('zarr', 'ome-zarr')
-    with new_folder(path) as folder:
-        array = zarr.create_array(
-            str(folder),
-            shape=projections.shape,
-            chunks=(min(VIEWS, len(projections)), *projections.shape[1:]),
-            dtype='float32',
-            dimension_names=('view', 'v', 'u'),
-            config={'write_empty_chunks': True},
-            overwrite=True,
-        )
-        for first in range(0, len(projections), VIEWS):
-            array[first : first + VIEWS] = projections[first : first + VIEWS]
+    return optional('zarr', 'ome-zarr').create_array(
+        str(folder),
+        shape=shape,
+        chunks=(min(VIEWS, shape[0]), *shape[1:]),
+        dtype='float32',
+        dimension_names=('view', 'v', 'u'),
+        config={'write_empty_chunks': True},
+        overwrite=True,
+    )
 
 
 def _opened(path: Path) -> Any:
@@ -126,18 +105,16 @@ def _opened(path: Path) -> Any:
             raise InputError(f'{path}: is damaged ({brief(error, 100)}); write it again') from None
 
 
-def _require_chunks(path: Path, array: Any, numbers: np.ndarray) -> None:
-    """Raises InputError if a chunk of these views has no file, because Zarr would read it as zeros."""
+def _require_chunks(path: Path, array: Any, chunks: Iterable[int]) -> None:
+    """Raises InputError if a chunk has no file, because Zarr would read it as zeros. chunks: along the views."""
     views, *panel = (int(n) for n in array.chunks)
     across = [range(-(-n // size)) for n, size in zip(array.shape[1:], panel)]
-    for chunk in np.unique(np.asarray(numbers) // views):
-        for place in product([int(chunk)], *across):
-            if not (path / array.metadata.encode_chunk_key(place)).is_file():
-                span = _span(np.arange(chunk * views, min((chunk + 1) * views, array.shape[0])))
-                raise InputError(
-                    f'{path}: lacks a chunk of the views {span}; write it again, chunks of zeros too (write_empty_chunks)'
-                )
-
-
-def _span(numbers: np.ndarray) -> str:
-    return f'{min(numbers)} to {max(numbers)}'
+    for chunk in chunks:
+        for row in across[0]:
+            for column in across[1]:
+                if not (path / array.metadata.encode_chunk_key((int(chunk), row, column))).is_file():
+                    last = min((chunk + 1) * views, array.shape[0]) - 1
+                    raise InputError(
+                        f'{path}: lacks a chunk of the views {chunk * views} to {last}; write it again, chunks of zeros too '
+                        '(write_empty_chunks)'
+                    )

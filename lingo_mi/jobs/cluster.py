@@ -1,4 +1,4 @@
-"""Jobs on the workers of a Dask cluster: one that is there already, or processes of this machine."""
+"""Jobs on the workers of a Dask cluster, which is running already or consists of processes of this machine."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ TIMED_OUT = TimeoutError, asyncio.TimeoutError  # one class from Python 3.11 on
 def opened(
     address: Any, folder: Path | None, threads: int = 0, variant: str | None = None, bar: bool = True
 ) -> Iterator[Cluster]:
-    """A cluster, connected to; workers that were started here end with the block.
+    """Connect to a cluster. Workers that were started here end with the block.
 
     Parameters
     ----------
@@ -46,12 +46,12 @@ def opened(
     variant : str or None
         Variant of Mitsuba on the workers; None: each chooses.
     bar : bool
-        Show how far the jobs are.
+        Whether to show a progress bar.
 
     Raises
     ------
     InputError
-        If nobody answers there, and for workers that cannot do the jobs.
+        If no scheduler answers, or a worker cannot do the jobs.
     """
     distributed = optional('distributed', 'cluster')
     if isinstance(address, distributed.Client):
@@ -66,8 +66,11 @@ def opened(
     with ExitStack() as stack:
         import dask.config
 
-        # No more than one job a worker is given away: the others wait for whoever is free.
-        stack.enter_context(dask.config.set({'distributed.scheduler.worker-saturation': 1.0}))
+        config = {
+            'distributed.scheduler.worker-saturation': 1.0,  # no more than one job a worker: the others wait for whoever is free
+            'distributed.deploy.lost-worker-timeout': '1 hour',  # on a busy machine, a worker takes more than 15 s to start again
+        }
+        stack.enter_context(dask.config.set(config))
         if local:
             count = int(local[1])
             threads = threads or max(1, cores() // count)
@@ -87,7 +90,7 @@ def opened(
 
 @contextmanager
 def workers(address: Any, path: Path) -> Iterator[Cluster]:
-    """The workers that write a file together, with this process's variant: see `opened`."""
+    """The workers that write a file together, with the variant of this process: see `opened`."""
     import mitsuba as mi
 
     with opened(address, path.parent, variant=mi.variant(), bar=False) as cluster:
@@ -105,7 +108,7 @@ class Cluster:
 
     @property
     def dashboard(self) -> str:
-        """Address of the page that shows what the workers do."""
+        """Address of Dask's dashboard."""
         return self.client.dashboard_link
 
     def run(self, jobs: list[Job], tell: Tell) -> None:
@@ -137,7 +140,7 @@ class Cluster:
                 future.release()
 
     def _stop(self, futures: list, topic: str) -> None:
-        """Tell all jobs to stop, and wait until no worker runs one any more: those that run store what they have."""
+        """Cancel all jobs, and wait until no worker runs one. A job that is running stores its work first."""
         print('\nstopping after a step of every job; Ctrl-C again to stop at once', file=sys.stderr)
         self.client.cancel(futures)
         ends = time.monotonic() + PATIENCE
@@ -178,7 +181,7 @@ def _follow(jobs: dict[str, Job], events: queue.SimpleQueue, tell: Tell, bar: Pr
             name, kind, value = events.get(timeout=0.5)
         except queue.Empty:
             continue
-        if name not in left:  # told before it ended, and come after
+        if name not in left:  # sent before the end of the job, and received after it
             continue
         if kind == 'ended':
             event = _end(name, value)

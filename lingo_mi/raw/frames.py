@@ -10,6 +10,7 @@ import numpy as np
 
 from lingo_mi.common.errors import InputError
 from lingo_mi.files import arrays
+from lingo_mi.files.hdf5_views import SUFFIXES
 from lingo_mi.files.slices import by_number, read_tiff_file, require_chain
 from lingo_mi.raw import dicom, hdf5, pictures, zeiss
 from lingo_mi.raw.recording import Frames, Recording, checked
@@ -142,5 +143,5 @@ FILES: dict[str, Callable[[Path], Recording]] = {
     '.edf': _edf,
     **dict.fromkeys(zeiss.SUFFIXES, zeiss.open_txrm),
     **dict.fromkeys(dicom.SUFFIXES, dicom.open_file),
-    **dict.fromkeys(('.h5', '.hdf5', '.hdf', '.nxs', '.nx'), hdf5.open_hdf5),
+    **dict.fromkeys(SUFFIXES, hdf5.open_hdf5),
 }

@@ -187,8 +187,8 @@ def photons_of_images(projections: np.ndarray, valid: np.ndarray | None = None) 
     what has edges. Of many views, MOST_VIEWS are measured. Pixels that a detector's blur correlates look less noisy, so this is
     then too many. inf without noise.
     """
-    some = np.unique(np.linspace(0, len(projections) - 1, MOST_VIEWS).astype(int))
-    p = np.asarray(projections[some], np.float64)
+    some = np.unique(np.linspace(0, projections.shape[0] - 1, MOST_VIEWS).astype(int))
+    p = np.stack([projections[i] for i in some]).astype(np.float64)
     n = p.shape[-1] - len(DIFFERENCE) + 1
     if n < 1:
         return np.inf

@@ -16,6 +16,7 @@ from lingo_mi.common.errors import InputError
 
 WINDOW, DEGREE = 21, 4  # columns of the curve, and its degree
 PASSES = 3  # each finds part of what the neighbours' offsets hid from the last
+MOST_PIXELS = 2**26  # of all views, in memory at a time: 256 MB
 LEAST_VIEWS = 25  # fewer leave so much of the object in the median that a sound chest changes by more than its noise
 LEAST_COLUMNS = 256  # on fewer, a body's details are as narrow as the curve: a chest on 192 columns loses 0.8 dB
 
@@ -25,8 +26,8 @@ def ring_offsets(projections: np.ndarray, valid: np.ndarray | None = None) -> np
 
     Parameters
     ----------
-    projections : ndarray
-        Line integrals [view, v, u].
+    projections : ndarray or zarr.Array
+        Line integrals [view, v, u]; of an array in a file, a block of rows at a time is in memory.
     valid : ndarray or None
         Bool, likewise; None: all. A pixel that is not valid in half of the views gets no offset.
 
@@ -42,9 +43,13 @@ def ring_offsets(projections: np.ndarray, valid: np.ndarray | None = None) -> np
     n, rows, columns = projections.shape
     require_enough(n, columns)
     offsets = np.zeros((rows, columns), np.float32)
-    for row in range(rows):
-        inside = None if valid is None else valid[:, row]
-        offsets[row] = _of_row(projections[:, row].astype(float), inside)
+    step = max(1, MOST_PIXELS // (n * columns))
+    for first in range(0, rows, step):
+        some = slice(first, first + step)
+        block = np.asarray(projections[:, some])  # of an array in chunks, all are read for it
+        for k in range(block.shape[1]):
+            inside = None if valid is None else valid[:, first + k]
+            offsets[first + k] = _of_row(block[:, k].astype(float), inside)
     return offsets
 
 

@@ -1,11 +1,11 @@
 """ASD-POCS over a volume that is larger than memory: the sweeps of `slab_sweeps`, and descents on total variation.
 
-A step of the descent needs the slices next to a slab: one for the gradient, and one more for the gradient after the step, whose
-length the next step needs. So a step reads the volume once and writes it once, and slabs exchange only their outer slices.
-Lengths, inner products and the largest gradient are those of the whole volume, put together from those of the slabs.
+A step of the descent needs two slices on either side of a slab: one for the gradient, and one more for the gradient after the
+step, because the next step needs its length. So a step reads the volume once and writes it once, and slabs exchange only their
+outer slices. Lengths, inner products and the largest gradient of the whole volume are sums or maxima over the slabs.
 
-The volume has four files: those before the pass and after its sweep are kept until the pass ends, since the changes by both
-parts of a pass are compared. The other two are read and written in turn.
+The volume is in four files. Two hold it before the pass and after the sweep of the pass, because the changes by sweep and descent
+are compared at the end. Steps read and write the other two in turn.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from lingo_mi.reconstruction.system import dot, evaluated, scalar
 from lingo_mi.reconstruction.tv_descent import tv_floor, tv_gradient
 from lingo_mi.scan import Scan
 
-PLANES = 2  # slices at either end of a slab that its neighbours need
+PLANES = 2  # slices at either end of a slab that its neighbours read
 
 
 class Changes(NamedTuple):
@@ -126,28 +126,28 @@ class DescentPlan(SweepPlan):
         return self._blocks + self.how.tviter
 
     def _written(self, begun):
-        """The files that a pass writes, one after the other, if the volume before it lies in one of them."""
+        """The files that a pass writes, one after the other. begun: the file of the volume before the pass."""
         a, b, c = (place for place in range(self.files) if place != begun)
         sweep = [(a, b)[i % 2] for i in range(self._blocks)]
         other = b if sweep[-1] == a else a
         return sweep + [(other, c)[i % 2] for i in range(self.how.tviter)]
 
     def _descend(self, k, system, share, scan, steps):
-        """The descent of pass k, or what is left of it."""
+        """Make the steps of the descent of pass k that are missing."""
         volume, how = system.volume, self.how
         floors, squares = np.array(list(share('begin'))).T
         floor, data = float(floors.max()), float(squares.sum() ** 0.5)
         step = volume.numbers['step'] if k else how.alpha * data
         length = sum(share('squared_gradient', floor)) ** 0.5
-        found = np.zeros(2)
+        sums = np.zeros(2)
         for i in range(volume.done % self._steps - self._blocks, how.tviter):
             last = i == how.tviter - 1
             scale = -step / length if length else 0.0
-            found = np.sum(list(share('descend', floor, scale, last, slab_done=steps)), 0)
+            sums = np.sum(list(share('descend', floor, scale, last, slab_done=steps)), 0)
             if not last:
                 volume.turn()
-                length = found[0] ** 0.5
-        changes = Changes(data, float(found[0] ** 0.5), float(found[1]))
+                length = sums[0] ** 0.5
+        changes = Changes(data, float(sums[0] ** 0.5), float(sums[1]))
 
         @cache
         def unmatched():
@@ -158,7 +158,7 @@ class DescentPlan(SweepPlan):
         volume.turn(step=step, ended=how.ends(how.lmbda * how.lmbda_red ** (k + 1), changes, unmatched))
 
     def _maxl2err(self, system, share, scan):
-        """|A x - b| at which the data count as matched, see `ASDPOCS`."""
+        """The largest |A x - b| of a volume that matches the data, see `ASDPOCS`."""
         if self.how.maxl2err is not None:
             return self.how.maxl2err
         if not can_rectify(scan):
@@ -182,18 +182,15 @@ class DescentSystem(SlabSystem):
     """The work of ASD-POCS on a slab besides the sweeps."""
 
     def backproject(self, part: int, filtered: FilteredViews) -> None:
-        """Write a slab of filtered backprojection where the next version will lie."""
+        """Write a slab of filtered backprojection in the place of the next version."""
         self.volume.write(part, filtered.slab(self.volume.parts[part]))
 
     def project_all(self, part: int, place: int) -> Iterator[np.ndarray]:
         """A x of a slab of the version at a place, view by view, float32 [pixel]."""
-        A, _ = self._projector(part)
-        x = evaluated(self._load(part, place))
-        for view in range(len(self.geometry)):
-            yield A.forward(x, [view])[0].numpy()
+        return self._by_view(self._projector(part)[0], evaluated(self._load(part, place)))
 
     def begin(self, part: int) -> np.ndarray:
-        """`tv_floor` of a slab after the sweep, and the square of the length of its change by the sweep."""
+        """`tv_floor` of a slab after the sweep, and the squared length of its change by the sweep."""
         places = self.volume.places
         begin, end = self.volume.parts[part]
         wide, below = self.volume.read_wide(part, 1, places.swept)
@@ -203,18 +200,18 @@ class DescentSystem(SlabSystem):
         return np.array([floor[0], dot(change, change)])
 
     def squared_gradient(self, part: int, floor: float) -> np.ndarray:
-        """The square of the length of the gradient in a slab."""
+        """The squared length of the gradient in a slab."""
         x, below = self.volume.read_wide(part, 1, self.volume.places.now)
         return np.array(self._square(part, mi.Float(x.ravel()), x.shape, below, floor))
 
     def descend(self, part: int, floor: float, scale: float, last: bool) -> np.ndarray:
-        """Write the next version of a slab, the gradient times `scale` further.
+        """Write the next version of a slab: add the gradient times `scale`.
 
         Returns
         -------
         ndarray
-            The square of the length of its gradient; of the last step, the square of the length of the change by the descent, and
-            its inner product with that by the sweep.
+            The squared length of the new gradient. After the last step instead: the squared length of the change by the descent,
+            and its inner product with the change by the sweep.
         """
         volume, (begin, end) = self.volume, self.volume.parts[part]
         wide, below = volume.read_wide(part, PLANES, volume.places.now)
@@ -226,7 +223,7 @@ class DescentSystem(SlabSystem):
         wide = x.numpy().reshape(size)
         slab = wide[:, :, below : below + end - begin]
         volume.write(part, slab, 0 if last else PLANES)
-        if not last:  # of the outermost slices the gradient was not known
+        if not last:  # the gradient in the outermost slices is wrong, because it lacks their neighbours
             narrow = wide[:, :, int(below == PLANES) : size[2] - int(above == PLANES)]
             return np.array([self._square(part, mi.Float(narrow.ravel()), narrow.shape, min(below, 1), floor)])
         swept = volume.read(part, volume.places.swept)
@@ -234,8 +231,8 @@ class DescentSystem(SlabSystem):
         return np.array([dot(descent, descent), dot(data, descent)])
 
     def _square(self, part, x, size, below, floor):
-        """The square of the length of the gradient of a slab with its neighbours' slices, so many of them below."""
+        """The squared length of the gradient in a slab. x: the slab with slices of its neighbours, `below` of them below it."""
         begin, end = self.volume.parts[part]
         gradient = tv_gradient(x, size, mi.Float(floor)).numpy().reshape(size)
-        own = mi.Float(gradient[:, :, below : below + end - begin].ravel())
-        return dot(own, own)
+        inner = mi.Float(gradient[:, :, below : below + end - begin].ravel())
+        return dot(inner, inner)

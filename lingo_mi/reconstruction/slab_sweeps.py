@@ -1,14 +1,14 @@
-"""Sweeps over a volume that is larger than memory: it lies on a disk, and one slab of it at a time is worked on.
+"""Sweeps over a volume that is larger than memory. The volume is on a disk, and one slab of it at a time is in memory.
 
-Line integrals of slabs add up to those of the whole volume if every voxel keeps the weights that it has there. A projector holds
-the outermost values for half a voxel, so a slab is projected between two slices of zeros, but at the ends of the volume.
+The line integrals of slabs add up to those of the whole volume if every voxel keeps its weights. A projector holds the outermost
+values for half a voxel. So a slab is projected between two slices of zeros, except at the ends of the volume.
 
-An update of the volume reads it once and writes it once. While a slab is in memory, it is changed by what the last views
-lacked, and the line integrals of the next ones are taken.
+An update reads the volume once and writes it once. While a slab is in memory, the update corrects it by the error of the last
+views, and takes the line integrals of the next ones.
 
-The volume lies in two files, which updates read and write in turn, and a third file says how many updates they have had. So
-work that was stopped at any moment, `kill -9` included, goes on after the last whole update, to the same result: to the last bit
-but where the source lies beside the volume: there `GridPair` projects, whose transpose adds in any order.
+The volume is in two files, which updates read and write in turn. A third file counts the updates. So after an interruption at any
+moment, `kill -9` included, the work continues after the last whole update. The result is the same to the last bit, unless the
+source lies beside the volume: `GridPair` then projects, and its transpose adds in any order.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from math import prod
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -48,7 +49,7 @@ SLABS, IMAGES = (
 
 
 class Share(Protocol):
-    """Does the same work for every slab of a volume, here or elsewhere."""
+    """Does the same work for every slab of a volume, in this process or on workers."""
 
     def __call__(self, work: str, *arguments: Any, slab_done: Callable[[], object] = lambda: None) -> Iterable[Any]:
         """Return the result of `SlabSystem.work(part, *arguments)` for each slab, from the first on: an array, or None.
@@ -67,7 +68,7 @@ class Share(Protocol):
 
 @dataclass(frozen=True)
 class SweepPlan:
-    """All that is done with a volume in slabs: updates one after the other.
+    """The work on a volume in slabs: updates, one after the other.
 
     Parameters
     ----------
@@ -83,19 +84,23 @@ class SweepPlan:
     files: ClassVar[int] = 2
 
     def system(self, geometry: Geometry, valid: np.ndarray | None, volume: SlabFiles) -> SlabSystem:
-        """Return the system that works on the slabs."""
+        """The object that works on the slabs."""
         return SlabSystem(geometry, valid, volume)
 
     def place(self, done: int) -> Places:
-        """Return the places of the versions after so many sweeps."""
+        """The places of the versions after so many of them."""
         return Places(done % 2 if done else None, (done + 1) % 2)
 
     def digest(self, scan: Scan, thickness: int) -> str:
         """A digest of all that the result depends on."""
-        return digest_of(scan, self.updates, self.noneg, thickness)
+        projector = projector_class(scan.geometry).__name__
+        digest = hashlib.sha256(repr((scan.digest(), projector, self.noneg, thickness)).encode())
+        for lmbda, views in self.updates:
+            digest.update(repr((lmbda, views.tolist())).encode())
+        return digest.hexdigest()
 
     def complete(self, system: SlabSystem, share: Share, scan: Scan, progress: Progress | None) -> None:
-        """Do what is left."""
+        """Make the versions of the volume that are missing."""
         volume = system.volume
         assert isinstance(volume, Volume)  # of which this process keeps the state
         if volume.done < len(self.updates):
@@ -105,13 +110,13 @@ class SweepPlan:
 
 
 class Steps:
-    """Tells `progress` of every slab that is done."""
+    """Counts the slabs that are done, for `progress`."""
 
     def __init__(self, done: int, versions: int, parts: int, progress: Progress | None):
         self._done, self._all, self._progress = done * parts, versions * parts, progress
 
     def __call__(self, relative: float | None = None) -> None:
-        """One slab more. relative: |A x - b| / |b| where it is known."""
+        """Count one more slab. relative: |A x - b| / |b|, or None."""
         self._done += 1
         if self._progress:
             self._progress(self._done, self._all, relative)
@@ -120,15 +125,15 @@ class Steps:
 def swept(
     scan: Scan, plan: SweepPlan, thickness: int, folder: Path, progress: Progress | None = None
 ) -> Iterator[np.ndarray]:
-    """The volume after all of a plan, in slabs [x, y, thickness] along z; the last may be thinner.
+    """The volume after all updates of a plan, in slabs [x, y, thickness] along z; the last may be thinner.
 
     Parameters
     ----------
     folder : Path
-        For the files. They stay, so that the volume can be had again at once; `discard` removes them.
+        For the files. They stay, so the next call returns the same volume at once; `discard` removes them.
     progress : Progress or None
-        Called after every slab as progress(slabs done, slabs to do in all, |A x - b| / |b| of the views of this update
-        before it, None where it is not known).
+        Called after every slab as progress(slabs done, all slabs, residual). The residual is |A x - b| / |b| of the views of this
+        update before it, or None.
 
     Raises
     ------
@@ -145,7 +150,7 @@ def swept(
 
 @contextmanager
 def opened(scan: Scan, plan: SweepPlan, thickness: int, folder: Path) -> Iterator[Volume]:
-    """The files of a plan, which this process has for itself; arguments and errors as of `swept`."""
+    """The files of a plan, locked for this process; arguments and errors as of `swept`."""
     grid = require_slabs(scan, thickness, plan.updates)
     digest = plan.digest(scan, thickness)
     with locked(folder), Volume(grid, thickness, folder, digest, plan.place, plan.files) as volume:
@@ -210,7 +215,13 @@ def sweep(
     steps: Steps,
     planes: int = 0,
 ) -> None:
-    """Update the volume by some blocks of views. planes: that the last update stores, see `SlabFiles.write`."""
+    """Update the volume by some blocks of views.
+
+    Parameters
+    ----------
+    planes : int
+        Outer slices of a slab that the last update stores, see `SlabFiles.write`.
+    """
     volume, following = system.volume, updates[0][1]
     assert isinstance(volume, Volume)
     ax = system.nothing(following)
@@ -219,18 +230,15 @@ def sweep(
     for i, (lmbda, views) in enumerate(updates):
         error, relative = _error(system, ax, scan.views(views), lengths[views])
         following = updates[i + 1][1] if i + 1 < len(updates) else None
-        kept = planes if following is None else 0
-
-        def report(relative=relative):
-            steps(relative)
-
-        images = share('update', error, views, lmbda, noneg, following, kept, slab_done=report)
+        outer = planes if following is None else 0
+        arguments = error, views, lmbda, noneg, following, outer
+        images = share('update', *arguments, slab_done=partial(steps, relative))
         ax = _added(images, None if following is None else system.nothing(following))
         volume.turn()
 
 
 class _Here:
-    """The work in this process, slab by slab."""
+    """Does the work in this process, slab by slab."""
 
     def __init__(self, system: SlabSystem):
         self._system = system
@@ -245,7 +253,7 @@ class _Here:
 
 
 def _added(images: Iterable[Any], total: Any) -> Any:
-    """The sum of all slabs' images in their order, so that the same bits come whoever made them."""
+    """The sum of the images of all slabs in their order, so it has the same bits in one process and on workers."""
     for image in images:
         if total is not None:
             total = evaluated(total + mi.Float(image))
@@ -262,21 +270,13 @@ def _error(system: SlabSystem, ax: mi.Float, projections: np.ndarray, lengths: n
     return evaluated(normalised(error, mi.Float(lengths.ravel()))), relative
 
 
-def digest_of(scan: Scan, updates: Sequence[Update], noneg: bool, thickness: int) -> str:
-    """A digest of all that the result depends on."""
-    found = hashlib.sha256(repr((scan.digest(), projector_class(scan.geometry).__name__, noneg, thickness)).encode())
-    for lmbda, views in updates:
-        found.update(repr((lmbda, views.tolist())).encode())
-    return found.hexdigest()
-
-
 class SlabSystem:
-    """The matrix A of a scan, by slabs of a volume on a disk. Images are mi.Float [view, u, v].
+    """The matrix A of a scan for the slabs of a volume on a disk. Images are mi.Float [view, u, v].
 
     Attributes
     ----------
     A
-        That of one slice, for what does not depend on the voxels.
+        The matrix of one slice, for numbers that do not depend on the voxels.
     """
 
     def __init__(self, geometry: Geometry, valid: np.ndarray | None, volume: SlabFiles):
@@ -286,9 +286,11 @@ class SlabSystem:
     def lengths(self, part: int) -> Iterator[np.ndarray]:
         """A 1 of a slab, view by view, float32 [pixel]."""
         A, inside = self._projector(part)
-        ones = evaluated(dr.select(inside(dr.arange(mi.UInt, A.voxels)), mi.Float(1), 0))
+        return self._by_view(A, evaluated(dr.select(inside(dr.arange(mi.UInt, A.voxels)), mi.Float(1), 0)))
+
+    def _by_view(self, A, x):
         for view in range(len(self.geometry)):
-            yield A.forward(ones, [view])[0].numpy()
+            yield A.forward(x, [view])[0].numpy()
 
     def project(self, part: int, views: np.ndarray) -> mi.Float:
         """A x of a slab in some views."""
@@ -338,7 +340,7 @@ class SlabSystem:
         return int(begin > 0), int(end < self.geometry.grid.shape[2])
 
     def _projector(self, part):
-        """The projector of a slab between its slices of zeros, and a function that tells whether a voxel is none of these."""
+        """The projector of a slab between its slices of zeros, and a function that tells whether a voxel lies in the slab."""
         (begin, end), (below, above) = self.volume.parts[part], self._margins(part)
         A = self.A.of_slab(self.geometry.on(self.geometry.grid.slab(begin - below, end + above)))
         low, high = (dr.opaque(mi.UInt, z) for z in (below, end - begin + below))

@@ -27,16 +27,16 @@ WORKERS = EXCHANGE, GROWING  # their folders
 
 
 class Places(NamedTuple):
-    """The numbers of the files in which versions of a volume lie.
+    """The numbers of the files that hold versions of a volume.
 
     Attributes
     ----------
     now
-        That is read; None: it is zero.
+        Of the version that is read; None: it is zero.
     to
-        That is written.
+        Of the version that is written.
     begun, swept
-        Of ASD-POCS: before this pass, None if that is zero; and after its sweep towards the data.
+        Of the versions before this pass of ASD-POCS (None: it is zero), and after the sweep of this pass.
     """
 
     now: int | None
@@ -46,14 +46,14 @@ class Places(NamedTuple):
 
 
 class SlabFiles:
-    """A volume in slabs, in some files of a folder: one is read, another one written.
+    """A volume in slabs, in some files of a folder: one is read, another one is written.
 
     Attributes
     ----------
     parts
         (begin, end) of the slabs.
     places
-        What lies in which file.
+        The files of the versions.
     folder
         Of the files.
     """
@@ -86,8 +86,8 @@ class SlabFiles:
         return np.zeros(shape, np.float32) if place is None else self._values(FILES[place], begin, shape)
 
     def read_wide(self, part: int, slices: int, place: int | None) -> tuple[np.ndarray, int]:
-        """A slab with so many slices of its neighbours on either side, as far as there are any, and how many lie below. The
-        version must have been written with `planes`."""
+        """A slab with up to so many slices of its neighbours on either side, and the number of slices below it. The version must
+        have been written with `planes`."""
         (begin, end), (nx, ny, nz) = self.parts[part], self._size
         low, high = max(begin - slices, 0), min(end + slices, nz)
         out = np.empty((nx, ny, high - low), np.float32)
@@ -97,15 +97,15 @@ class SlabFiles:
         return out, begin - low
 
     def write(self, part: int, slab: np.ndarray, planes: int = 0) -> None:
-        """Set a slab of the next version, and so many slices at either end for `read_wide` of its neighbours."""
+        """Write a slab of the next version, and so many slices at either end for `read_wide` of its neighbours."""
         begin, end = self.parts[part]
         name = FILES[self.places.to]
         self._put(name, begin, slab)
         for z in {*range(begin, min(begin + planes, end)), *range(max(end - planes, begin), end)}:
-            self._put(name + PLANES, z, slab[:, :, z - begin])  # where it would lie if all were there
+            self._put(name + PLANES, z, slab[:, :, z - begin])  # at the place of this slice in a whole volume
 
     def flush(self) -> None:
-        """Bring what was written to the disk."""
+        """Wait until all that was written is on the disk."""
         with writing(self.folder):
             while self._written:
                 os.fsync(self._file(self._written.pop()).fileno())
@@ -128,14 +128,14 @@ class SlabFiles:
 
 
 class Volume(SlabFiles):
-    """The files, and the state that says how far their work has come.
+    """The files of a volume, and its state, which counts the versions.
 
     Attributes
     ----------
     done
-        How often a version was completed.
+        Number of versions that are complete.
     numbers
-        What the work must remember, by name.
+        Numbers that the work needs again after an interruption, by name.
     """
 
     def __init__(
@@ -237,7 +237,7 @@ def discard(folder: Path) -> None:
 
 
 class Images:
-    """An image for each view, float32 [view, pixel], at first zero, in a file that has no name and ends with this object."""
+    """An image for each view, float32 [view, pixel], in a temporary file. The images are zero at first."""
 
     def __init__(self, folder: Path, count: int, pixels: int):
         with writing(folder):
@@ -249,7 +249,7 @@ class Images:
         return np.stack([self._read(view) for view in views])
 
     def add(self, images: Iterable[np.ndarray]) -> None:
-        """Add an image to that of every view."""
+        """Add one image to each view."""
         for view, image in enumerate(images):
             total = self._read(view) + image
             with writing(self._folder):

@@ -233,7 +233,16 @@ def scans() -> dict[str, list[Sample]]:
         projections=PROJECTIONS, DSO=210.0, DSD=553.0, dDetector=[0.4, 0.4], angles=np.arange(3.0), air=np.float32(0.1)
     )
     mask = npy(np.ones((3, 4, 5), bool))
+    geometry = Structured(SCANNER, as_yaml)
     return {
+        'zarr, yml': [
+            Sample('s.zarr', {f's.zarr/{name}': part for name, part in files.items()} | {'s.yml': geometry})
+            for files in _chunked_projections()
+        ],
+        'hdf5, yml': [
+            Sample('s.h5', {'s.h5': _hdf5(chunks, packed), 's.yml': geometry})
+            for chunks, packed in ((None, None), ((1, 4, 5), None), ((2, 4, 5), 'gzip'))
+        ],
         'naf': [
             Sample('s.pickle', {'s.pickle': Structured(naf, lambda d, p=p: pickle.dumps(d, p))}) for p in (0, 2, 4, 5)
         ],
@@ -253,6 +262,40 @@ def scans() -> dict[str, list[Sample]]:
             )
         ],
     }
+
+
+def _chunked_projections():
+    """Files of a Zarr array in chunks of two views, Zarr 3 and 2, with packed chunks and without."""
+    views = [PROJECTIONS[:2], np.stack([PROJECTIONS[2], np.zeros((4, 5), np.float32)])]
+    shape, chunks = [3, 4, 5], [2, 4, 5]
+    for packed in (False, True):
+        parts = [gzip.compress(part.tobytes(), mtime=0) if packed else part.tobytes() for part in views]
+        third = dict(
+            zarr_format=3, node_type='array', shape=shape, data_type='float32', fill_value=0, attributes={},
+            chunk_grid=dict(name='regular', configuration=dict(chunk_shape=chunks)),
+            chunk_key_encoding=dict(name='default', configuration=dict(separator='/')),
+            codecs=[
+                dict(name='bytes', configuration=dict(endian='little')),
+                *[dict(name='gzip', configuration=dict(level=5))] * packed,
+            ],
+        )  # fmt: skip
+        second = dict(
+            zarr_format=2, shape=shape, chunks=chunks, dtype='<f4', fill_value=0, order='C', filters=None,
+            compressor=dict(id='gzip', level=5) if packed else None,
+        )  # fmt: skip
+        yield {'zarr.json': Structured(third, as_json)} | {f'c/{i}/0/0': part for i, part in enumerate(parts)}
+        yield {'.zarray': Structured(second, as_json)} | {f'{i}.0.0': part for i, part in enumerate(parts)}
+
+
+def _hdf5(chunks, compression) -> bytes:
+    import h5py
+
+    stream = io.BytesIO()
+    with h5py.File(stream, 'w') as file:
+        file.create_dataset(
+            'exchange/data', data=PROJECTIONS, chunks=chunks, compression=compression, track_times=False
+        )
+    return stream.getvalue()
 
 
 RTK = (

@@ -132,7 +132,7 @@ def scenes() -> dict[str, tuple[Callable[[Path, Random], None], list[Sample]]]:
 
 NAMES = (
     'npy', 'npz', 'nii', 'nii.gz', 'hdr, img', 'nrrd', 'mha, mhd', 'raw', 'ome-zarr', 'tiff', 'dicom', 'naf', 'r2', 'npy, yml',
-    'public scans', 'exr folder', 'ply', 'exr', 'poses', 'checkpoint', 'scene',
+    'zarr, yml', 'hdf5, yml', 'public scans', 'exr folder', 'ply', 'exr', 'poses', 'checkpoint', 'scene',
 )  # fmt: skip
 
 

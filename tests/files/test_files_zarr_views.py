@@ -77,7 +77,7 @@ def test_bad_input(scan, path):
     refused('view 5 holds NaN', lambda: read_scan(path).train.views([4, 5]))
     geometry = path.with_suffix('.yml')
     words = geometry.read_text()
-    geometry.write_text(words + 'input: intensity\nI0: 2\n')
+    geometry.write_text(words.replace('input: line_integral', 'input: intensity\nI0: 2'))
     refused('are line integrals', lambda: read_scan(path))
     geometry.write_text(words.replace('nDetector: [6, 8]', 'nDetector: [6, 9]'))
     refused(r'have the shape \(10, 6, 8\)', lambda: read_scan(path))

@@ -11,9 +11,11 @@ import lingo_mi as lm
 from helpers.raw_frames import check, load, raw_frames, save
 from lingo_mi.cli import main
 from lingo_mi.common.errors import InputError
+from lingo_mi.files import scans
 from lingo_mi.files.scans import write_scan
 from lingo_mi.geometry import rtk
-from lingo_mi.raw.importing import import_raw
+from lingo_mi.raw import importing
+from lingo_mi.raw.importing import import_raw, import_to_zarr
 from lingo_mi.raw.line_integrals import photons_of_images
 from lingo_mi.raw.options import Options
 
@@ -25,11 +27,72 @@ def test_truth_comes_back(tmp_path, raw, scan_yml):
 def test_photons(tmp_path, scan_yml):
     """Twenty flats tell the photons to 5 %, the images to 15 %."""
     raw = raw_frames(shape=(96, 160))
-    scan, history = import_raw(
+    scan, imported = import_raw(
         save(tmp_path, raw) and tmp_path / 'views.npy', scan_yml, Options(**save(tmp_path, raw)), False
     )
-    assert history['photons_from_flats'] == pytest.approx(raw.photons, rel=0.05)
+    assert imported.history['photons_from_flats'] == pytest.approx(raw.photons, rel=0.05)
     assert photons_of_images(scan.projections, scan.valid) == pytest.approx(raw.photons, rel=0.15)
+
+
+@pytest.mark.parametrize('what', ['bad pixels', 'rings', 'all pixels are valid', 'a view is black'])
+def test_into_a_zarr(tmp_path, scan_yml, monkeypatch, what):
+    """A few views at a time, and the same as in memory: line integrals, mask, history and geometry."""
+    zarr = pytest.importorskip('zarr')
+    n = 30 if what == 'rings' else 6
+    raw = raw_frames(n=n, shape=(12, 300) if what == 'rings' else (24, 40))
+    values = yaml.safe_load(scan_yml.read_text())
+    scan_yml.write_text(yaml.safe_dump(values | dict(angles=np.linspace(0, 300, n).tolist())))
+    if what == 'a view is black':
+        raw.views[4] = raw.darks[0]
+    save(tmp_path, raw)
+    options = dict(flats=tmp_path / 'flats.npy', darks=tmp_path / 'darks.npy', rings=what == 'rings')
+    if what == 'all pixels are valid':
+        options = dict(i0=20000.0, saturation=1e9)
+    options = Options(**options)
+    monkeypatch.setattr('lingo_mi.raw.rings.MOST_PIXELS', 5 * n * 300)  # five rows at a time
+    with warnings.catch_warnings():
+        warnings.simplefilter('ignore')
+        wanted, imported = import_raw(tmp_path / 'views.npy', scan_yml, options, False)
+        written, write, size = [], zarr.Array.__setitem__, wanted.projections[0].size
+
+        def counted(array, index, values):
+            written.append(np.size(values) // size)
+            write(array, index, values)
+
+        monkeypatch.setattr(zarr.Array, '__setitem__', counted)
+        found = import_to_zarr(tmp_path / 'views.npy', scan_yml, options, tmp_path / 'b.zarr', False)
+    monkeypatch.undo()
+    assert found.history == imported.history and found.left_out == imported.left_out
+    assert max(written) == 4
+    scan = scans.read_scan(tmp_path / 'b.zarr').train
+    np.testing.assert_array_equal(scan.projections, wanted.projections)
+    np.testing.assert_array_equal(scan.valid, wanted.valid)
+    assert (scan.stored is None) == (what != 'all pixels are valid') == (tmp_path / 'b.valid.npy').exists()
+    assert scans.history_of(tmp_path / 'b.zarr') == found.history
+    np.testing.assert_allclose(scan.geometry.rays().source, wanted.geometry.rays().source)
+
+
+def test_an_import_into_a_zarr_that_fails(tmp_path, raw, scan_yml, capsys, monkeypatch):
+    """Leaves nothing. An earlier scan stays."""
+    pytest.importorskip('zarr')
+    out = tmp_path / 'out' / 'a.zarr'
+    files = [str(tmp_path / f'{name}.npy') for name in ('views', 'flats', 'darks')]
+    save(tmp_path, raw)
+    arguments = ['lingo-mi', 'import', files[0], '--flats', files[1], '--darks', files[2], '--geometry', str(scan_yml)]
+
+    def run(*more):
+        monkeypatch.setattr(sys, 'argv', [*arguments, '--out', str(out), *more])
+        with pytest.raises(SystemExit) as stop:
+            main()
+        return stop.value.code
+
+    with monkeypatch.context() as patch:
+        patch.setattr(importing, 'photons_of_images', lambda *_: (_ for _ in ()).throw(InputError('it broke')))
+        assert run() == 2 and capsys.readouterr().err.splitlines()[-1].endswith('it broke')
+    assert not out.exists() and not list(out.parent.iterdir())
+    assert run() == 0 and f'{out}: 6 views of 24 x 40 pixels' in capsys.readouterr().out
+    assert {file.name for file in out.parent.iterdir()} == {'a.zarr', 'a.yml', 'a.valid.npy'}
+    assert run('--force') == 2 and 'a.zarr: exists already; remove it or give another name' in capsys.readouterr().err
 
 
 def test_without_noise_exact(tmp_path, scan_yml):

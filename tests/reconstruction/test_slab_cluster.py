@@ -4,9 +4,9 @@ import errno
 import os
 import signal
 import threading
-import time
 from dataclasses import replace
 
+import mitsuba as mi
 import numpy as np
 import pytest
 
@@ -20,7 +20,7 @@ from lingo_mi.files.volumes import read_volume
 from lingo_mi.files.zarr_views import ZarrViews
 from lingo_mi.fitting.slab_cluster import voxelize_on
 from lingo_mi.geometry import Grid
-from lingo_mi.jobs.cluster import Cluster
+from lingo_mi.jobs.cluster import Cluster, opened
 from lingo_mi.jobs.in_process import InProcess
 from lingo_mi.reconstruction import ASDPOCS, FDK, OSSART, SART
 from lingo_mi.reconstruction.run import run_in_slabs
@@ -169,20 +169,17 @@ def test_a_volume_of_a_fit_that_was_stopped(scan, tmp_path, monkeypatch):
 
 
 @pytest.fixture(scope='module')
-def client():
-    """Of two workers that are processes, which a nanny replaces when they die."""
-    import distributed
-
-    options = dict(n_workers=2, threads_per_worker=1, dashboard_address=None, memory_limit=0)
-    with distributed.LocalCluster(**options) as local, distributed.Client(local, set_as_default=False) as client:
-        yield client
+def client(tmp_path_factory):
+    """Of local:2, two processes that are replaced when they die."""
+    with opened('local:2', tmp_path_factory.mktemp('workers'), variant=mi.variant(), bar=False) as cluster:
+        yield cluster.client
 
 
 @pytest.fixture
 def workers(client):
-    """The client, whose workers are new again after the test."""
+    """The client, whose workers are as before again after the test."""
     yield client
-    client.restart()
+    client.run(slab_faults.undo)
 
 
 @pytest.mark.thorough
@@ -190,9 +187,9 @@ def workers(client):
 @pytest.mark.parametrize(
     'algorithm, at',
     [
-        pytest.param(OSSART(niter=2, blocksize=3), 3, id='os-sart'),
-        pytest.param(ASDPOCS(niter=2, tviter=3, blocksize=5), 2, id='asd-pocs, a sweep'),
-        pytest.param(ASDPOCS(niter=2, tviter=3, blocksize=5), 8, id='asd-pocs, a descent'),
+        pytest.param(OSSART(niter=2, blocksize=5), 3, id='os-sart'),
+        pytest.param(ASDPOCS(niter=1, tviter=3, blocksize=5), 2, id='asd-pocs, a sweep'),
+        pytest.param(ASDPOCS(niter=1, tviter=3, blocksize=5), 8, id='asd-pocs, a descent'),
     ],
 )
 def test_a_worker_dies_in_a_slab(scan, tmp_path, workers, algorithm, at):
@@ -210,13 +207,13 @@ def test_a_worker_dies_in_a_slab(scan, tmp_path, workers, algorithm, at):
 @pytest.mark.thorough
 @pytest.mark.posix
 @pytest.mark.parametrize(
-    'algorithm', [OSSART(niter=2, blocksize=3), ASDPOCS(niter=1, tviter=1, blocksize=5), FDK()], ids=lambda a: a.name
+    'algorithm', [OSSART(niter=2, blocksize=5), ASDPOCS(niter=1, tviter=1, blocksize=5), FDK()], ids=lambda a: a.name
 )
 def test_interrupted(scan, tmp_path, workers, algorithm):
     """After Ctrl-C no file is half written, and no worker has a task; the same call goes on."""
     run_in_slabs(scan, algorithm, tmp_path / 'one.ome.zarr', 64)
     workers.run(slab_faults.slow_slabs, 1.0, tmp_path / 'began')
-    home, began = tmp_path / 'home', time.monotonic()
+    home = tmp_path / 'home'
     home.mkdir()
 
     def interrupt():
@@ -228,11 +225,10 @@ def test_interrupted(scan, tmp_path, workers, algorithm):
     with pytest.raises(KeyboardInterrupt):
         lm.reconstruct(scan, algorithm, out=home / 'many.ome.zarr', cluster=workers, progress=False)
     thread.join()
-    assert time.monotonic() - began < 30  # it waits for the slabs that are being made, not for its patience to end
     assert not any(workers.run(tasks_of_worker).values()) and not workers.run_on_scheduler(tasks_of_scheduler)
     assert [p.name for p in home.iterdir()] == ['many.ome.zarr.slabs']
     assert not list(home.rglob('.lingo_mi*'))
-    workers.restart()
+    workers.run(slab_faults.undo)
     lm.reconstruct(scan, algorithm, out=home / 'many.ome.zarr', cluster=workers, progress=False)
     require_same(home / 'many.ome.zarr', tmp_path / 'one.ome.zarr')
     assert [p.name for p in home.iterdir()] == ['many.ome.zarr']
@@ -250,7 +246,7 @@ def test_the_disk_of_the_workers_is_full(scan, tmp_path, workers):
     assert '\n' not in str(error.value) and [p.name for p in tmp_path.iterdir()] == [folder.name]
     halves = sorted((folder / 'growing.ome.zarr' / 'halves').iterdir())
     assert [file.name for file in halves] == ['00000000.npy', '00000128.npy']
-    workers.restart()
+    workers.run(slab_faults.undo)
     again = []
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(

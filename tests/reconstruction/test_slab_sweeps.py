@@ -20,7 +20,7 @@ from lingo_mi.geometry import Grid, PosedGeometry
 from lingo_mi.geometry.rays import Rays
 from lingo_mi.reconstruction import OSSART, SART, SIRT
 from lingo_mi.reconstruction.run import run_algorithm
-from lingo_mi.reconstruction.slab_sweeps import digest_of
+from lingo_mi.reconstruction.slab_sweeps import SweepPlan
 from lingo_mi.reconstruction.slab_volume import discard
 
 RECONSTRUCT = FIT.with_name('reconstruct.py')
@@ -126,7 +126,8 @@ def test_poses_in_the_middle_count(scan, tmp_path):
     for poses in (many, moved):
         g = scan.geometry
         geometry = PosedGeometry(poses=poses, nDetector=g.nDetector, grid=g.grid)
-        digests.append(digest_of(lm.Scan(geometry, np.zeros((400, *g.nDetector), np.float32)), [], True, 8))
+        views = lm.Scan(geometry, np.zeros((400, *g.nDetector), np.float32))
+        digests.append(SweepPlan([], True).digest(views, 8))
     assert digests[0] != digests[1]
 
 
