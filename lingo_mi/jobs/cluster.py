@@ -218,8 +218,12 @@ def _local(distributed: Any, count: int) -> Iterator[str]:
     def options(i):
         env = {'CUDA_VISIBLE_DEVICES': gpus[i % len(gpus)]} if gpus else {}
         return dict(
-            nthreads=1, memory_limit=0, env=env, silence_logs=logging.ERROR
-        )  # memory is watched by `lingo_mi.common.memory`
+            nthreads=1,
+            memory_limit=0,  # memory is watched by `lingo_mi.common.memory`
+            env=env,
+            silence_logs=logging.ERROR,
+            preload=['lingo_mi.jobs.worker'],
+        )
 
     workers = {i: dict(cls=distributed.Nanny, options=options(i)) for i in range(count)}
     scheduler = dict(cls=distributed.Scheduler, options=dict(host='127.0.0.1', dashboard_address='127.0.0.1:0'))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -11,6 +12,14 @@ from lingo_mi.common.errors import InputError
 from lingo_mi.jobs.job import Event, Job, attempt
 
 PAUSE = 1.0  # seconds between two reports
+
+
+def dask_setup(dask_worker: Any) -> None:
+    """Ignore Ctrl-C in a worker process of local:N, which Dask preloads with this module.
+
+    A terminal sends it to all processes. The client alone stops jobs, so that they store their work.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def describe_worker(folder: str | None, dask_worker: Any) -> dict:

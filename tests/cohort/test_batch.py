@@ -13,7 +13,7 @@ from helpers.cohorts import BATCH, events, results
 from helpers.script import FIT, SCENE, run
 from lingo_mi.cohort import work
 from lingo_mi.cohort.listing import BadList, read_list
-from lingo_mi.cohort.row import Row, stored
+from lingo_mi.cohort.row import SCAN, Row, stored
 from lingo_mi.cohort.table import Table
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import write_scan
@@ -145,6 +145,16 @@ def test_another_scan_of_the_same_name_is_another_request(home):
     assert batch(home)[0] == 0
     (home / 'one.yml').write_text(text.replace('DSO: 100', 'DSO: 99'))
     assert 'content of the scan' in batch(home)[2]
+
+
+def test_the_geometry_of_projections_in_chunks_is_part_of_the_request(tmp_path):
+    pytest.importorskip('zarr')
+    geometry = lm.Geometry.parallel(nDetector=4, dDetector=1, nVoxel=4, dVoxel=1, angles=[0.0, 1.5])
+    write_scan(tmp_path / 'one.zarr', lm.Scan(geometry, np.ones((2, 4, 4), np.float32)), 'zarr')
+    row = Row('one', 1, str(tmp_path), 'one.zarr')
+    before, file = row.request(), tmp_path / 'one.yml'
+    file.write_text(file.read_text().replace('dVoxel: [1.0', 'dVoxel: [1.5'))
+    assert {name for name in before if row.request()[name] != before[name]} == {SCAN}
 
 
 def test_the_table_has_the_steps_that_were_made(home):

@@ -3,6 +3,8 @@
 import errno
 import os
 import signal
+import subprocess
+import sys
 import threading
 from dataclasses import replace
 
@@ -232,6 +234,23 @@ def test_interrupted(scan, tmp_path, workers, algorithm):
     lm.reconstruct(scan, algorithm, out=home / 'many.ome.zarr', cluster=workers, progress=False)
     require_same(home / 'many.ome.zarr', tmp_path / 'one.ome.zarr')
     assert [p.name for p in home.iterdir()] == ['many.ome.zarr']
+
+
+@pytest.mark.thorough
+@pytest.mark.posix
+def test_interrupted_in_a_terminal(scan, tmp_path):
+    """Ctrl-C reaches the workers of local:N as well. They print nothing."""
+    write_scan(tmp_path / 'scan.zarr', scan, 'zarr')
+    home, state = tmp_path / 'home', tmp_path / 'home' / 'a.ome.zarr.slabs' / 'state.json'
+    home.mkdir()
+    words = 'reconstruct ../scan.zarr --algorithm os-sart -D niter=500 --cluster local:2 --out a.ome.zarr'
+    command = [sys.executable, '-m', 'lingo_mi', *words.split(), '--variant', mi.variant()]
+    process = subprocess.Popen(command, cwd=home, stdout=-1, stderr=-1, text=True, start_new_session=True)
+    wait_until(lambda: process.poll() is not None or state.exists() and '"updates": 0' not in state.read_text())
+    os.killpg(process.pid, signal.SIGINT)
+    _, err = process.communicate(timeout=300)
+    assert process.returncode == 130 and 'Traceback' not in err, err
+    assert [p.name for p in home.iterdir()] == ['a.ome.zarr.slabs'] and not list(home.rglob('.lingo_mi*'))
 
 
 @pytest.mark.thorough
