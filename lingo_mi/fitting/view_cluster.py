@@ -2,7 +2,7 @@
 
 Every worker keeps the scan on its device. In a step it receives the Gaussians, renders and differentiates its part of the views,
 and returns sums. This process adds the sums and updates the Gaussians, so a step has the result of one process, up to the order
-of additions. Of each Gaussian with a density, a worker receives 11 numbers and returns 13: 96 bytes a step.
+of additions. For each Gaussian with a density, a worker receives 11 numbers and returns 13: 96 bytes a step.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Sums:
-    """What `ViewSums.add` adds and returns, on the host.
+    """Sums that `ViewSums.add` adds and returns, on the host.
 
     Parameters
     ----------

@@ -91,7 +91,7 @@ def differentiate(
     signal: Any = None,
     share: Any = None,
 ) -> tuple[Any, Any, Any, Any]:
-    """Add the gradient of one view's loss to that of the Gaussians (with gradients enabled).
+    """Add the gradient of one view's loss to the gradient of the Gaussians (with gradients enabled).
 
     1. the view's part of the loss, Float [1], not multiplied by the loss scale
     2. the norm of the gradient with respect to each projected centre, Float [N], for densification

@@ -1,4 +1,4 @@
-"""What a step needs of its views: the sums of their losses, gradients and statistics, made on this device or elsewhere."""
+"""Sums over the views of a step: losses, gradients and statistics, made on this device or elsewhere."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 class Statistic(Protocol):
-    """Where the densification statistic is added, `State.gradient` and `State.visits`: Float [N]."""
+    """Target of the densification statistic: `State.gradient` and `State.visits`, Float [N]."""
 
     gradient: Any
     visits: Any
@@ -24,7 +24,7 @@ class ViewSums(Protocol):
     def add(
         self, fit: GaussianStepper, leaf: tuple, statistic: Statistic, views: Sequence[int], batch: int, iteration: int
     ) -> tuple[Any, Any]:
-        """Add the gradients of some views to those of the Gaussians, and their statistic to that of the fit.
+        """Add the gradients of some views to the Gaussians' gradients, and their statistic to the fit's statistic.
 
         Parameters
         ----------
@@ -33,7 +33,7 @@ class ViewSums(Protocol):
         leaf : tuple
             The Gaussians of `ForwardModel.gaussians`, with gradients enabled.
         statistic : Statistic
-            Where norms and visits are added.
+            Target of norms and visits.
         views : sequence of int
             Numbers of the views.
         batch : int

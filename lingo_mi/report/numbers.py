@@ -89,7 +89,7 @@ SETTINGS = {
     ),
     'iterations': Number('Iterations', '', ',d', 'Steps of the optimiser, one batch of views each.'),
     'stopping': Number(
-        'Early stop', '', '', 'Views that were held out told after which step more of them no longer helped.'
+        'Early stop', '', '', 'The step after which more steps no longer improved the prediction of held-out views.'
     ),
     'lingo': Number(
         "LINGO's parts",

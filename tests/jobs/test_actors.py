@@ -20,7 +20,7 @@ def local():
 
 
 class Squares:
-    """What is kept on each worker; `gone`: every call fails as that of a lost worker does."""
+    """An object on each worker; with `gone`, every call fails like a call of a lost worker."""
 
     def __init__(self, gone=False):
         self.gone = gone
@@ -59,7 +59,7 @@ def test_calls_are_divided(local):
 
 
 def test_a_part_is_done_again(local):
-    """That of a worker which is lost, and no other."""
+    """Only the part of a lost worker is done again."""
     actors, lost = Actors(local, Squares()), []
     ready = actors._ready
 
