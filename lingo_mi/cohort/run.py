@@ -49,7 +49,7 @@ def run_cohort(rows: Sequence[Row], out: Path, runner: Runner, done: dict[str, d
     Parameters
     ----------
     done : dict[str, dict]
-        As `done_already` returns them.
+        The results that `done_already` returns.
     """
     for leftover, target in leftovers(out):
         if target in (CSV, PARQUET):  # the lock is ours

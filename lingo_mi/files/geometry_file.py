@@ -246,7 +246,7 @@ def geometry_file_of(path: Path, geometry: PathLike | str | None = None) -> Any:
 
 
 def has_geometry_file(path: Path) -> bool:
-    """Whether a geometry file lies beside an array."""
+    """Return whether a geometry file lies beside an array."""
     return any(file.exists() for file in _beside(path))
 
 

@@ -48,12 +48,12 @@ class HDF5Views(FileViews):
 
 
 def hdf5_views(path: Path, dataset: str | None = None, rows_run_up: bool = False) -> HDF5Views:
-    """The projections in an HDF5 file, none of which are read yet.
+    """The projections in an HDF5 file. None are read yet.
 
     Parameters
     ----------
     path : Path
-        Of the file.
+        Path of the file.
     dataset : str or None
         Name of the dataset [n, v, u]; None: /exchange/data of a Data Exchange file without flats and darks.
     rows_run_up : bool

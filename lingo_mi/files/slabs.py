@@ -177,7 +177,7 @@ class SharedZarr:
     folder: Path
 
     def holds(self, begin: int) -> bool:
-        """Whether the slab that begins at this slice has been written."""
+        """Return whether the slab that begins at this slice has been written."""
         return self._half(begin).exists()
 
     def write(self, begin: int, slab: np.ndarray) -> None:

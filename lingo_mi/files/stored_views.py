@@ -1,4 +1,4 @@
-"""What projections in a Zarr array and in an HDF5 file have in common: views are read where they are needed, and checked."""
+"""Base of projections in a Zarr array or an HDF5 file: views are read when they are needed, and checked."""
 
 from __future__ import annotations
 

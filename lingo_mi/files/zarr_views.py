@@ -36,7 +36,7 @@ class ZarrViews(FileViews):
 
 
 def zarr_views(path: Path, rows_run_up: bool = False) -> ZarrViews:
-    """The projections of a Zarr array, none of which are read yet.
+    """The projections of a Zarr array. None are read yet.
 
     Parameters
     ----------
@@ -70,9 +70,9 @@ def new_zarr_views(folder: Path, shape: tuple[int, int, int]) -> Any:
     Parameters
     ----------
     folder : Path
-        Of the array.
+        Folder of the array.
     shape : tuple of int
-        Of the projections [n, v, u].
+        Shape of the projections [n, v, u].
 
     Returns
     -------

@@ -36,7 +36,7 @@ def describe_worker(folder: str | None, dask_worker: Any) -> dict:
 
 
 def runs_job(topic: str, dask_worker: Any) -> bool:
-    """Whether this worker runs a job of a topic, cancelled ones included; called by `Client.run`."""
+    """Return whether this worker runs a job of a topic, also a cancelled one; called by `Client.run`."""
     return any(str(task.key).startswith(topic) for task in dask_worker.state.executing)
 
 
@@ -103,7 +103,7 @@ def work(job: Job, key: str, topic: str, folder: str | None, threads: int, varia
 
 
 def prepare(worker: Any, folder: str | None, threads: int, variant: str | None) -> None:
-    """Check this worker, and choose its variant and its threads; arguments as of `work`.
+    """Check this worker, and choose its variant and its threads; arguments as for `work`.
 
     Raises
     ------

@@ -30,7 +30,7 @@ CLIPPED = 1e-3  # part of a view's pixels with the same highest count
 
 
 class Imported(NamedTuple):
-    """What is said of a scan that was made of raw frames.
+    """Summary of a scan that was made from raw frames.
 
     Parameters
     ----------

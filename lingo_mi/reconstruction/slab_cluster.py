@@ -46,9 +46,9 @@ def sweep_on(
     Parameters
     ----------
     runner : Runner
-        Of the workers, who see `folder` and the place of `path`.
+        Runner of the workers, which see `folder` and the place of `path`.
     path : Path
-        Of the OME-Zarr.
+        Path of the OME-Zarr.
     """
     with opened(scan, plan, thickness, folder) as volume, exchange_folder(folder, volume) as exchange:
         if scan.valid is not None:
@@ -62,7 +62,7 @@ def sweep_on(
 def fdk_on(
     runner: Runner, algorithm: FDK, scan: Scan, thickness: int, folder: Path, path: Path, progress: Progress | None
 ) -> None:
-    """Let workers make the volume of `FDK.slabs` and write it as OME-Zarr; arguments as of `sweep_on`.
+    """Let workers make the volume of `FDK.slabs` and write it as OME-Zarr; arguments as for `sweep_on`.
 
     This process filters the views of a scan in memory. Workers filter the views of a scan in a file.
     """
@@ -176,13 +176,13 @@ class SlabTask:
     plan : SweepPlan
         Without its updates.
     geometry : Geometry
-        Of the scan.
+        Geometry of the scan.
     thickness : int
         Slices of a slab.
     folder, exchange : Path
-        Of the volume, and of the arrays and results.
+        Folder of the volume, and folder of the arrays and results.
     places : Places
-        Of the volume.
+        Places of the volume's versions.
     step : str
         Name of this step, another one for every version of the volume.
     work : str
@@ -293,13 +293,13 @@ def _run(runner: Runner, jobs: list[Job], slab_done: Callable[[], object]) -> No
 
 
 def _step(volume: Volume) -> str:
-    """How the names of all steps on this version of a volume begin."""
+    """Return the beginning of the names of all steps on this version of a volume."""
     return f'{volume.done}-'
 
 
 @contextmanager
 def exchange_folder(folder: Path, volume: Volume | None = None) -> Iterator[Path]:
-    """The folder for arrays and results, below that of the volume. It stays after an error if it holds results.
+    """The folder for arrays and results, below the volume's folder. It stays after an error if it holds results.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Sweeps over a volume that is larger than memory. The volume is on a disk, and one slab of it at a time is in memory.
 
-The line integrals of slabs add up to those of the whole volume if every voxel keeps its weights. A projector holds the outermost
-values for half a voxel. So a slab is projected between two slices of zeros, except at the ends of the volume.
+The line integrals of slabs add up to line integrals of the whole volume if every voxel keeps its weights. A projector holds the
+outermost values for half a voxel. So a slab is projected between two slices of zeros, except at the ends of the volume.
 
 An update reads the volume once and writes it once. While a slab is in memory, the update corrects it by the error of the last
 views, and takes the line integrals of the next ones.
@@ -102,7 +102,7 @@ class SweepPlan:
     def complete(self, system: SlabSystem, share: Share, scan: Scan, progress: Progress | None) -> None:
         """Make the versions of the volume that are missing."""
         volume = system.volume
-        assert isinstance(volume, Volume)  # of which this process keeps the state
+        assert isinstance(volume, Volume)  # this process keeps its state
         if volume.done < len(self.updates):
             steps = Steps(volume.done, len(self.updates), len(volume.parts), progress)
             lengths = path_lengths(system, share, scan)
@@ -150,7 +150,7 @@ def swept(
 
 @contextmanager
 def opened(scan: Scan, plan: SweepPlan, thickness: int, folder: Path) -> Iterator[Volume]:
-    """The files of a plan, locked for this process; arguments and errors as of `swept`."""
+    """The files of a plan, locked for this process; arguments and errors as for `swept`."""
     grid = require_slabs(scan, thickness, plan.updates)
     digest = plan.digest(scan, thickness)
     with locked(folder), Volume(grid, thickness, folder, digest, plan.place, plan.files) as volume:

@@ -32,11 +32,11 @@ class Places(NamedTuple):
     Attributes
     ----------
     now
-        Of the version that is read; None: it is zero.
+        Number of the version that is read; None: it is zero.
     to
-        Of the version that is written.
+        Number of the version that is written.
     begun, swept
-        Of the versions before this pass of ASD-POCS (None: it is zero), and after the sweep of this pass.
+        Numbers of the versions before this pass of ASD-POCS (None: it is zero), and after the sweep of this pass.
     """
 
     now: int | None
@@ -55,7 +55,7 @@ class SlabFiles:
     places
         The files of the versions.
     folder
-        Of the files.
+        Folder of the files.
     """
 
     def __init__(self, grid: Grid, thickness: int, folder: Path, places: Places):
@@ -190,12 +190,12 @@ def work_folder(path: Path) -> Path:
 
 
 def read_state(folder: Path, digest: str) -> tuple[int, dict[str, Any]]:
-    """How many versions of a volume the state file in a folder counts, and its numbers by name; (0, {}) without a file.
+    """Return the number of versions that the state file in a folder counts, and its numbers by name; (0, {}) without a file.
 
     Parameters
     ----------
     digest : str
-        Of all that the result depends on.
+        Digest of everything that the result depends on.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What happens to a worker of a cluster in the middle of a slab; called by `Client.run`."""
+"""Faults of a cluster's worker in the middle of a slab; called by `Client.run`."""
 
 import errno
 import itertools

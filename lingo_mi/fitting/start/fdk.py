@@ -52,7 +52,29 @@ class FDKStart(NumberedStart):
     def from_volume(
         self, volume: np.ndarray, half: np.ndarray, rng: np.random.Generator, unit: float = 1.0
     ) -> StartingCloud:
-        """The cloud from a volume [x, y, z] in the fit's unit; half the volume's sides [3] are in the normalised frame."""
+        """Draw the cloud from a volume.
+
+        Parameters
+        ----------
+        volume : ndarray
+            [x, y, z] in the fit's unit.
+        half : [3]
+            Half the volume's sides in the normalised frame.
+        rng : Generator
+            Generator of all random choices.
+        unit : float
+            The density that the fit counts as 1, in 1/mm.
+
+        Returns
+        -------
+        StartingCloud
+            In the normalised frame.
+
+        Raises
+        ------
+        InputError
+            If no voxel is above `fdk_threshold`.
+        """
         cells = np.flatnonzero(volume > self.fdk_threshold)
         if len(cells) == 0:
             raise InputError(

@@ -88,7 +88,29 @@ class MaskStart(NumberedStart):
     def from_views(
         self, scan: Scan, rng: np.random.Generator, render: Render | None = None, fdk: np.ndarray | None = None
     ) -> StartingCloud:
-        """The cloud; a density 'lsq' or 'fdk' needs `render`, and 'fdk' the volume [x, y, z]."""
+        """Make the cloud from line integrals.
+
+        Parameters
+        ----------
+        scan : Scan
+            Line integrals.
+        rng : Generator
+            Generator of all random choices.
+        render : callable, optional
+            Renders a cloud of isotropic Gaussians; see `Render`. The densities 'lsq' and 'fdk' need it.
+        fdk : ndarray, optional
+            A volume [x, y, z], 1/mm, for the density 'fdk'.
+
+        Returns
+        -------
+        StartingCloud
+            In the normalised frame.
+
+        Raises
+        ------
+        InputError
+            If `render` or `fdk` is missing, and if no voxel lies in the masks of all views.
+        """
         rays, shape, half = scan.geometry.normalised_rays(), scan.geometry.grid.shape, scan.geometry.grid.half
         projections, valid = np.asarray(scan.normalised, np.float32), scan.valid
         if self.density not in FACTORS and render is None:
