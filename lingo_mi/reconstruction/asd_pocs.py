@@ -154,6 +154,9 @@ class ASDPOCS(Algorithm):
                 residuals[-1] = system.residual(projected)[1]
             return residuals[-1] * system.size_b
 
+        def unmatched() -> bool:
+            return maxl2err == 0 or error() > maxl2err
+
         for k in range(self.niter):
             if self.exact_every and k % self.exact_every == 0:
                 system.correct(x)
@@ -168,11 +171,11 @@ class ASDPOCS(Algorithm):
             x = minimise_tv(x, scan.geometry.grid.shape, step, self.tviter)
             tv_change = evaluated(x - projected)
             changes = Changes(data_length, norm(tv_change), dot(data_change, tv_change))
-            step = self.next_step(step, changes, lambda: error() > maxl2err)
+            step = self.next_step(step, changes, unmatched)
             lmbda *= self.lmbda_red
             if progress:
                 progress(k + 1, self.niter, None if np.isnan(residuals[-1]) else residuals[-1])
-            if self.ends(lmbda, changes, lambda: error() > maxl2err):
+            if self.ends(lmbda, changes, unmatched):
                 break
             if watch is not None and watch(k + 1, x):
                 break
