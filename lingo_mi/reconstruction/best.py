@@ -24,27 +24,30 @@ from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.asd_pocs import ASDPOCS
-from lingo_mi.reconstruction.held_out import Score, Trial, TrialWatch, split_views
+from lingo_mi.reconstruction.held_out import PATIENCE, Score, Trial, TrialWatch, split_views
 from lingo_mi.reconstruction.parameters import check_counts
 from lingo_mi.reconstruction.penalised import MOST, TRIED, PenalisedLeastSquares
 from lingo_mi.reconstruction.priors import Prior
 from lingo_mi.reconstruction.refined import Refined, structure
+from lingo_mi.reconstruction.sart import SART
 from lingo_mi.reconstruction.voxel_values import means, values
 from lingo_mi.reconstruction.wide_pixels import excess_width
 from lingo_mi.scan import Scan, values_digest
 from lingo_mi.storage.file_access import as_path, new_file, write_text, writing
 
 START, TRIAL = 10, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
-LONG = 50  # passes of ASD-POCS, at most, if it is the result itself
-AHEAD = 0.9  # times the score of the scan's own voxels: below it smaller ones are clearly ahead after `TRIAL` passes
+LONG, SWEEPS = 50, 20  # passes of ASD-POCS and of SART, at most, if they are the result itself
+AHEAD = 0.9  # times another score: below it a setting is clearly ahead, whatever passes the other one still gets
+TESTED = 8  # passes of a refinement that are tried: if the last of them still gain, noise does not limit their number
 MARGIN = 1.02  # how much better the scan's own voxels must be than smaller ones, see `Best`
 LITTLE = 0.95  # times the score after one pass of a refinement: if more passes gain less, noise limits them
 LMBDA, LMBDA_RED = 1.8, 0.97  # of the refinement: long steps converge sooner, and shorten before they take up the noise
+TVITER, ALPHA = 10, 0.24  # of the refinement: half as many steps as `Refined`, twice as long, are as good in less time
 SMOOTH = 0.5  # alpha of the refinement with more total variation, for noisy scans
 SPREAD = 1.0  # standard deviation of the neighbourhood of a voxel in `error_map`, voxels
 DOUBTFUL = 0.5  # a score above it says that something is wrong; sound scans of 1000 photons a pixel or more reach 0.36
 PLAIN = 'asd-pocs'
-VOXELS = 'means', 'values', 'finer'
+VOXELS = MEANS, VALUES, FINER = 'means', 'values', 'finer'
 TICKS = 20  # steps of the progress for a fit
 
 # Fits a cloud: called as fit(scan, progress), with progress(steps done, steps). Returns a function of a grid, which gives the
@@ -85,8 +88,10 @@ class Chosen(Reconstruction):
         for i, trial in enumerate(self.plan):
             size = ' x '.join(f'{d / trial.finer:.4g}' for d in self.spacing)
             mark = '*' if i == self.taken else ' '
-            how = f'{trial.niter:2} passes' if trial.strength is None else f'strength {trial.strength:g}'
-            output = '' if trial.output_score is None else f', {trial.output_score:.5f} as given out'
+            how = (
+                f'{trial.passes or trial.niter:2} passes' if trial.strength is None else f'strength {trial.strength:g}'
+            )
+            output = ''.join(f', {score:.5f} as {kind}' for kind, score in trial.given.items())
             lines.append(f'{mark} {trial.name:22} voxels {size} mm, {how}: {trial.score:.5f}{output}')
         return '\n'.join(lines)
 
@@ -132,7 +137,8 @@ class Best(Algorithm):
        limits them, and `Best` tries more total variation.
     3. With `prior`, it tries `PenalisedLeastSquares`, and the held-out views choose the strength. With `cloud`, it fits a cloud
        of Gaussians to the other views, and tries the best of these refinements from the cloud's volume.
-    4. The setting that predicts the held-out views best, with its number of passes, is applied to all views.
+    4. `ASDPOCS` and `SART` get all their passes, unless the best setting is far ahead of them by then.
+    5. The setting that predicts the held-out views best, with its number of passes, is applied to all views.
 
     Smaller voxels suit objects finer than the voxels, because the scan's voxels turn such detail into streaks. Streaks lie along
     the views of the reconstruction, and held-out views hardly show them. The scan's own voxels must therefore be better by
@@ -152,9 +158,9 @@ class Best(Algorithm):
         Seed of the random orders, at least 0.
     voxels : {'means', 'values', 'finer'}
         What a number means if smaller voxels win. 'means': the mean over the voxel's cube, to view, measure and compare.
-        'values': the value at its centre, between which projectors interpolate linearly (`voxel_values.values`). The held-out
-        views then judge every setting, and ASD-POCS with all its passes, by the projections of these values. 'finer': the smaller
-        voxels themselves. If the scan's own voxels win, numbers are values at the centres.
+        'values': the value at its centre, between which projectors interpolate linearly (`voxel_values.values`). 'finer': the
+        smaller voxels themselves. If the scan's own voxels win, numbers are values at the centres. The held-out views judge
+        'values' and 'finer' as they are given out, but 'means' by the smaller voxels, because projectors blur even true means.
     prior : Prior, optional
         A prior to try beside the other settings.
 
@@ -201,8 +207,8 @@ class Best(Algorithm):
             require_type('prior', self.prior, Prior, 'such as lm.TV()')
 
     def steps(self, scan: Scan) -> int:
-        more = (2 * TICKS + self.niter if self.cloud else 0) + (TRIED * MOST if self.prior else 0)
-        return 2 * START + 2 * TRIAL + 3 * self.niter + more + (LONG if self.voxels == 'values' else 0)
+        more = (2 * TICKS + TESTED if self.cloud else 0) + (TRIED * MOST if self.prior else 0)
+        return 2 * START + TRIAL + 3 * TESTED + 2 * self.niter + more + LONG + SWEEPS
 
     def grid(self, geometry: Geometry) -> Grid:
         return geometry.grid.finer(self.finer)
@@ -238,7 +244,7 @@ class Best(Algorithm):
             )
         result = self._apply(scan, chosen, count, fit)
         assert chosen.volume is not None  # of its best pass
-        tried, volume = (self._output(v, chosen.finer) for v in (chosen.volume, result.volume))
+        tried, volume = (_given(v, chosen.finer, self.voxels) for v in (chosen.volume, result.volume))
         if progress is not None:
             progress(self.steps(scan), self.steps(scan), result.residuals[-1])
         for trial in plan:
@@ -248,34 +254,41 @@ class Best(Algorithm):
             volume,
             result.residuals,
             time.perf_counter() - began,
-            grid.finer(chosen.finer) if self.voxels == 'finer' else grid,
+            grid.finer(chosen.finer) if self.voxels == FINER else grid,
             tuple(plan),
             next(i for i, trial in enumerate(plan) if trial is chosen),
             error_map(volume, tried),
-            'means' if self.voxels == 'means' and chosen.finer > 1 else 'values',
+            MEANS if self.voxels == MEANS and chosen.finer > 1 else VALUES,
             grid.spacing,
         )
 
-    def _output(self, volume: np.ndarray, finer: int) -> np.ndarray:
-        """The volume of a setting in the voxels of the result."""
-        if finer == 1 or self.voxels == 'finer':
-            return volume
-        return means(volume, finer) if self.voxels == 'means' else values(means(volume, finer))
-
     def _judged(self, plan: list[Trial], train: Scan, held_out: Scan, count) -> Trial:
-        """The trial to apply. ASD-POCS gets all its passes first, if it may be the result."""
-        chosen = min(_best(plan[1:]), plan[0], key=lambda trial: trial.score)
-        if self.voxels != 'values' and chosen is not plan[0]:
-            return chosen
+        """The trial to apply. ASD-POCS and SART get all their passes, unless a refinement is far ahead of them. If one of them is
+        ahead then, the refinement gets all its passes, too.
+        """
+
+        def error(trial: Trial) -> float:
+            return trial.given.get(VALUES, trial.score) if self.voxels == VALUES else trial.score
+
+        def best(trials: list[Trial]) -> Trial:
+            return min(trials, key=error) if self.voxels == VALUES else _best(trials)
+
+        refined = best([trial for trial in plan[1:] if trial.volume is not None])
+        if error(refined) < AHEAD * plan[0].score:
+            return refined
         if len(plan[0].scores) == START:  # it could go on
             plan[0] = self._plain(train, held_out, count, LONG)
-        if self.voxels != 'values':
-            return min(_best(plan[1:]), plan[0], key=lambda trial: trial.score)
-        score = Score(held_out)
-        for trial in plan:
-            if trial.volume is not None:
-                trial.output_score = score(uploaded(self._output(trial.volume, trial.finer)))
-        return min(plan, key=lambda trial: np.inf if trial.output_score is None else trial.output_score)
+        sart = Trial(SART.name, 1)
+        SART(niter=SWEEPS, seed=self.seed)._run(
+            train, progress=count, watch=TrialWatch(Score(held_out), sart, slow=True)
+        )
+        plan.insert(1, sart)
+        chosen = min(best([refined, sart]), plan[0], key=error)
+        if chosen is refined or refined.passes <= TESTED or refined.cloud:
+            return chosen
+        again = self._try(train, held_out, plan[0], _refined(refined.finer, refined.smooth), count, whole=True)
+        plan.append(again)
+        return min(best([again, sart]), plan[0], key=error)
 
     def _plain(self, train: Scan, held_out: Scan, count, niter: int) -> Trial:
         plain = Trial(PLAIN, 1)
@@ -327,19 +340,27 @@ class Best(Algorithm):
 
         return fit(scan, progress)(scan.geometry.grid.finer(finer))
 
-    def _try(self, train, held_out, start: Trial, trial: Trial, count, beat=None, by=0) -> Trial:
+    def _try(self, train, held_out, start: Trial, trial: Trial, count, beat=None, by=0, whole=False) -> Trial:
         """Refine the volume of another trial."""
         assert start.volume is not None  # of its best pass
         trial.before = start.niter if start.name == PLAIN else 0
         score = Score(held_out.on(held_out.geometry.grid.finer(trial.finer)))
-        niter = min(by, self.niter) if by and beat is None else self.niter
+        niter = self.niter if whole else min(by if by and beat is None else TESTED, self.niter)
         refine(
             train, start.volume, niter, trial.finer, trial.smooth, self.seed, count, TrialWatch(score, trial, beat, by)
         )
+        if len(trial.scores) == TESTED < trial.niter + PATIENCE:
+            trial.passes = self.niter
+        if trial.finer > 1:
+            score, volume = Score(held_out), trial.volume
+            assert volume is not None
+            trial.given = {kind: score(uploaded(_given(volume, trial.finer, kind))) for kind in (MEANS, VALUES)}
         return trial
 
     def _apply(self, scan: Scan, trial: Trial, count, fit: Fit | None) -> Reconstruction:
         """The chosen setting on all views, from the start: passes from the trial's volume save time, but lost up to 1.5 dB."""
+        if trial.name == SART.name:
+            return SART(niter=trial.niter, seed=self.seed)._run(scan, progress=count)
         if trial.strength is not None:
             return self._penalised(trial.strength)._run(scan, start=trial.volume, progress=count)
         if trial.cloud:
@@ -350,7 +371,7 @@ class Best(Algorithm):
             if trial.name == PLAIN:
                 return plain
             start = plain.volume
-        return refine(scan, start, trial.niter, trial.finer, trial.smooth, self.seed, count)
+        return refine(scan, start, trial.passes or trial.niter, trial.finer, trial.smooth, self.seed, count)
 
     @staticmethod
     def _counter(progress: Progress | None, steps: int):
@@ -389,9 +410,9 @@ def refine(
     fine = scan.on(scan.geometry.grid.finer(finer))
     if start.shape == scan.geometry.grid.shape:
         start = _parts(start, finer)
-    algorithm = replace(Refined(niter=niter, seed=seed).on_measured(), lmbda=LMBDA, lmbda_red=LMBDA_RED)
-    if smooth:
-        algorithm = replace(algorithm, alpha=SMOOTH)
+    how = Refined(niter=niter, seed=seed)
+    how = replace(how, alpha=SMOOTH) if smooth else replace(how, tviter=TVITER, alpha=ALPHA)
+    algorithm = replace(how.on_measured(), lmbda=LMBDA, lmbda_red=LMBDA_RED)
     weights, blur = structure(start), excess_width(fine.geometry)
     return algorithm._run(fine, start=start, weights=weights, blur=blur, progress=progress, watch=watch)
 
@@ -400,9 +421,9 @@ def _refined(finer: int, smooth: bool = False, cloud: bool = False) -> Trial:
     return Trial('refined' + ', smooth' * smooth + ', cloud' * cloud, finer, smooth, cloud)
 
 
-def _best(refinements: Sequence[Trial]) -> Trial:
+def _best(trials: Sequence[Trial]) -> Trial:
     """The one with the lowest score; the scan's own voxels must be better than smaller ones by `MARGIN`."""
-    return min(refinements, key=lambda trial: trial.score * (MARGIN if trial.finer == 1 else 1))
+    return min(trials, key=lambda trial: trial.score * (MARGIN if trial.finer == 1 else 1))
 
 
 def error_map(volume: np.ndarray, fewer: np.ndarray) -> np.ndarray:
@@ -414,6 +435,13 @@ def error_map(volume: np.ndarray, fewer: np.ndarray) -> np.ndarray:
     """
     square = ndimage.gaussian_filter((volume - fewer) ** 2, SPREAD)
     return np.sqrt(np.maximum(square, 0))
+
+
+def _given(volume: np.ndarray, finer: int, voxels: str) -> np.ndarray:
+    """The numbers that are given out for a volume (`Best.voxels`)."""
+    if finer == 1 or voxels == FINER:
+        return volume
+    return means(volume, finer) if voxels == MEANS else values(means(volume, finer))
 
 
 def _parts(volume: np.ndarray, finer: int) -> np.ndarray:

@@ -77,12 +77,14 @@ class Trial:
         `Score` of the held-out views after every pass; of a prior, of every strength.
     volume : ndarray or None
         After the pass with the lowest score, on the setting's own voxels.
-    output_score : float or None
-        `Score` of the numbers that would be given out, if these decide, else None.
+    given : dict[str, float]
+        `Score` of the numbers that would be given out for smaller voxels: of their 'means' and 'values' (`Best.voxels`).
     strength : float or None
         Strength of a prior, else None.
     before : int
         Passes of ASD-POCS that it starts from.
+    passes : int
+        Passes over all views if it is chosen: more than `niter` if its last passes still gained. 0: `niter`.
     """
 
     name: str
@@ -91,9 +93,10 @@ class Trial:
     cloud: bool = False
     scores: list[float] = field(default_factory=list)
     volume: np.ndarray | None = None
-    output_score: float | None = None
+    given: dict[str, float] = field(default_factory=dict)
     strength: float | None = None
     before: int = 0
+    passes: int = 0
 
     @property
     def niter(self) -> int:
@@ -113,9 +116,10 @@ class Trial:
             niter=self.niter,
             score=self.score,
             scores=self.scores,
-            given=self.output_score,
+            given=self.given,
             strength=self.strength,
             before=self.before,
+            passes=self.passes or self.niter,
         )
 
 

@@ -29,7 +29,7 @@ from __future__ import annotations
 
 import time
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from os import PathLike
 from typing import Any, ClassVar
@@ -128,6 +128,7 @@ class Sweeps(Algorithm):
         progress: Progress | None = None,
         weights: ArrayLike | None = None,
         blur: Sequence[float] | None = None,
+        watch: Callable[[int, mi.Float], bool] | None = None,
     ) -> Reconstruction:
         """Reconstruct the volume of a scan, see `run_algorithm`. Without tol, the residual is not computed after every pass, of
         which it takes a third of the time, but at the end.
@@ -138,6 +139,8 @@ class Sweeps(Algorithm):
             Weights of the voxels [x, y, z], at least 0: relative sizes of their changes (default: equal).
         blur : Sequence[float] or None
             Blur of the change by a pass: standard deviations in voxels along x, y, z (default: none).
+        watch : callable or None
+            Called after every pass as watch(passes done, volume on the device, mi.Float [voxels]); True stops.
         """
         began, how = time.perf_counter(), self._by_blocks(len(scan))
         order = passes(scan.geometry.angles, how.blocksize, how.OrderStrategy, how.seed)
@@ -153,6 +156,8 @@ class Sweeps(Algorithm):
             dr.sync_thread()  # Ctrl-C comes through between passes
             if progress:
                 progress(k + 1, how.niter, residuals[-1] if measured else None)
+            if watch is not None and watch(k + 1, x):
+                break
         return Reconstruction(system.volume(x), residuals, time.perf_counter() - began, scan.geometry.grid)
 
     def slabs(

@@ -135,6 +135,7 @@ METHODS = {
     'fast': Method("`fast`, the cloud's volume", lambda scan: _cloud(scan)(scan.geometry.grid)),
     'refined': Method('`fast`, then `refined`, `finer=2`', _refined),
     'best': Method('`best`', lambda scan: run_algorithm(scan, Best()).volume),
+    'best-values': Method("`best`, `voxels='values'`", lambda scan: run_algorithm(scan, Best(voxels='values')).volume),
     'best-finer': Method("`best`, `voxels='finer'`", lambda scan: run_algorithm(scan, Best(voxels='finer')).volume),
 }
 NEEDS = {
