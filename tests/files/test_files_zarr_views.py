@@ -1,5 +1,6 @@
 """Projections in a Zarr array: read where they are needed, and one line for what is missing."""
 
+import json
 import pickle
 import shutil
 from dataclasses import replace
@@ -94,3 +95,33 @@ def test_bad_input(scan, path):
     refused('damaged', lambda: read_scan(path))
     refused('ends in .zarr', lambda: write_scan(path.with_name('scan.a'), scan, 'zarr'))
     refused('exists already', lambda: write_scan(path, scan, 'zarr'))
+
+
+def changed(path, **fields):
+    file = path / 'zarr.json'
+    file.write_text(json.dumps(json.loads(file.read_text()) | fields))
+
+
+@pytest.mark.parametrize(
+    'change, words',
+    [
+        (lambda path: (path / 'zarr.json').unlink(), 'scan.zarr: has no array in scan.zarr'),
+        (
+            lambda path: changed(path, data_type='float64'),
+            'scan.zarr: a chunk of the views 0 to 9 is cut off or damaged',
+        ),
+        (lambda path: changed(path, data_type='complex64', fill_value=[0, 0]), 'real numbers .n, v, u. are needed'),
+        (lambda path: changed(path, shape=[10, 6, 7]), r'have the shape \(10, 6, 7\)'),
+        (lambda path: changed(path, shape=[10**12, 6, 8]), 'scan.zarr: lacks a chunk of the views 12 to 15'),
+        (lambda path: changed(path, chunk_grid=grid([5, 6, 8])), 'a chunk of the views 0 to 9 is cut off or damaged'),
+        (lambda path: changed(path, chunk_grid=grid([10**9, 6, 8])), 'scan.zarr: .* memory'),
+        (lambda path: (path / 'c/1/0/0').write_bytes((path / 'c/1/0/0').read_bytes() * 2), 'is cut off or damaged'),
+    ],
+)
+def test_metadata_that_do_not_fit(path, change, words):
+    change(path)
+    refused(words, lambda: read_scan(path).train.projections)
+
+
+def grid(chunk_shape):
+    return dict(name='regular', configuration=dict(chunk_shape=chunk_shape))
