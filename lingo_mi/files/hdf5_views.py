@@ -81,18 +81,27 @@ def hdf5_views(path: Path, dataset: str | None = None, rows_run_up: bool = False
                 f'{path}: holds raw frames with flats or darks; make a scan of them: lingo-mi import {path} '
                 '--geometry scanner.yml --out scan.zarr'
             )
-        shape = require_projections(where, data.shape or (), data.dtype)
-        if data.is_virtual or data.external:
-            raise InputError(f'{where} lies in other files; copy it into one file')
-        size = data.dtype.itemsize
-        if data.chunks is None:
-            whole = data.id.get_storage_size() >= prod(shape) * size
-        else:
-            require_room(prod(data.chunks) * size, path)
-            whole = data.id.get_num_chunks() >= prod(-(-n // chunk) for n, chunk in zip(shape, data.chunks))
-        if not whole:  # HDF5 would read them as zeros
-            raise InputError(f'{where} lacks views that were never written; write it again')
+        try:
+            shape = require_projections(where, data.shape or (), data.dtype)
+            if data.is_virtual or data.external:
+                raise InputError(f'{where} lies in other files; copy it into one file')
+            _require_whole(where, data)
+        except InputError:
+            raise
+        except Exception as error:  # of damaged headers: many kinds
+            raise InputError(f'{where} is damaged ({brief(error, 100)}); copy it again') from None
     return HDF5Views(path, shape, np.arange(shape[0]), rows_run_up, dataset=dataset or EXCHANGE)
+
+
+def _require_whole(where: str, data: Any) -> None:
+    """Raises InputError if parts of a dataset were never written, because HDF5 would read them as zeros."""
+    if data.chunks is None:
+        whole = data.id.get_storage_size() >= prod(data.shape) * data.dtype.itemsize
+    else:
+        require_room(prod(data.chunks) * data.dtype.itemsize, where)
+        whole = data.id.get_num_chunks() >= prod(-(-n // chunk) for n, chunk in zip(data.shape, data.chunks))
+    if not whole:
+        raise InputError(f'{where} lacks views that were never written; write it again')
 
 
 @contextmanager

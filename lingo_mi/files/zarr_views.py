@@ -59,6 +59,8 @@ def zarr_views(path: Path, rows_run_up: bool = False) -> ZarrViews:
     shape = require_projections(path, tuple(int(n) for n in array.shape), np.dtype(array.dtype))
     if getattr(array, 'shards', None):
         raise InputError(f'{path}: keeps several chunks in a file (shards); write it with chunks alone')
+    if min(array.chunks) < 1:
+        raise InputError(f'{path}: has chunks of the shape {list(array.chunks)}; write it again')
     require_room(prod(int(n) for n in array.chunks) * np.dtype(array.dtype).itemsize, path)
     _require_chunks(path, array, range(-(-shape[0] // int(array.chunks[0]))))
     return ZarrViews(path, shape, np.arange(shape[0]), rows_run_up)

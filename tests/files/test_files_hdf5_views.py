@@ -92,6 +92,14 @@ def test_a_chunk_is_damaged(path):
     refused('scan.h5: the views 4 to 6 are damaged', lambda: found.views([6, 4]))
 
 
+def test_the_index_of_the_chunks_is_damaged(path):
+    """Found by mutation."""
+    content = path.read_bytes()
+    assert content.count(b'TREE') > 1
+    path.write_bytes(content.replace(b'TREE\x01', b'TREF\x01'))  # of chunks; that of groups has the type 0
+    refused('scan.h5', lambda: read_scan(path).train.views([0]))
+
+
 def test_views_that_were_never_written(path):
     with h5py.File(path, 'w') as file:
         data = file.create_dataset('exchange/data', (10, 6, 8), 'f4', chunks=(4, 6, 8))

@@ -114,6 +114,7 @@ def changed(path, **fields):
         (lambda path: changed(path, shape=[10, 6, 7]), r'have the shape \(10, 6, 7\)'),
         (lambda path: changed(path, shape=[10**12, 6, 8]), 'scan.zarr: lacks a chunk of the views 12 to 15'),
         (lambda path: changed(path, chunk_grid=grid([5, 6, 8])), 'a chunk of the views 0 to 9 is cut off or damaged'),
+        (lambda path: changed(path, chunk_grid=grid([4, 0, 8])), 'scan.zarr: '),
         (lambda path: changed(path, chunk_grid=grid([10**9, 6, 8])), 'scan.zarr: .* memory'),
         (lambda path: (path / 'c/1/0/0').write_bytes((path / 'c/1/0/0').read_bytes() * 2), 'is cut off or damaged'),
     ],
