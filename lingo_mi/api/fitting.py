@@ -83,9 +83,10 @@ def fit(
     log_dir : path, optional
         A folder for TensorBoard's events: numbers, slices, views (needs the extra 'tensorboard').
     cluster : str or Client, optional
-        A Dask cluster whose workers render and differentiate the views of each step, of which there must be several: batch=N, one
-        or more for each worker. It is the scheduler's address or file, 'local:N' for N processes of this machine, or a client of
-        `distributed`. The result is that of one process up to rounding. If a worker dies, others do its views.
+        A Dask cluster whose workers render and differentiate the views of each step. A step must have several views: batch=N,
+        one or more for each worker. The cluster is the scheduler's address or file, 'local:N' for N processes of this machine,
+        or a client of `distributed`. The result is the same as on one process, up to rounding. If a worker dies, others do its
+        views.
     note : dict, optional
         Further entries of metrics.json in the folder.
     options

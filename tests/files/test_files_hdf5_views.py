@@ -73,11 +73,11 @@ def test_a_dataset_that_the_geometry_names(tmp_path, dtype):
 
 
 def test_a_file_is_cut_off(path):
-    found, content = read_scan(path).train, path.read_bytes()
+    scan, content = read_scan(path).train, path.read_bytes()
     for size in (len(content) // 2, 100, 0):
         path.write_bytes(content[:size])
         refused('scan.h5: is cut off, damaged or not HDF5', lambda: read_scan(path))
-        refused('scan.h5: is cut off, damaged or not HDF5', lambda: found.views([0]))
+        refused('scan.h5: is cut off, damaged or not HDF5', lambda: scan.views([0]))
 
 
 def test_a_chunk_is_damaged(path):
@@ -87,16 +87,16 @@ def test_a_chunk_is_damaged(path):
     damaged = bytearray(content)
     damaged[chunk.byte_offset : chunk.byte_offset + chunk.size] = b'x' * chunk.size
     path.write_bytes(damaged)
-    found = read_scan(path).train
-    assert found.views([0]).shape == (1, 6, 8)
-    refused('scan.h5: the views 4 to 6 are damaged', lambda: found.views([6, 4]))
+    scan = read_scan(path).train
+    assert scan.views([0]).shape == (1, 6, 8)
+    refused('scan.h5: the views 4 to 6 are damaged', lambda: scan.views([6, 4]))
 
 
 def test_the_index_of_the_chunks_is_damaged(path):
     """Found by mutation."""
     content = path.read_bytes()
     assert content.count(b'TREE') > 1
-    path.write_bytes(content.replace(b'TREE\x01', b'TREF\x01'))  # of chunks; that of groups has the type 0
+    path.write_bytes(content.replace(b'TREE\x01', b'TREF\x01'))  # of chunks; a tree of groups has the type 0
     refused('scan.h5', lambda: read_scan(path).train.views([0]))
 
 

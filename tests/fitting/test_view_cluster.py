@@ -38,8 +38,8 @@ class Copies:
 
     parts = ()
 
-    def __init__(self, cluster, thing):
-        self.copies = [pickle.loads(pickle.dumps(thing)) for _ in range(2)]
+    def __init__(self, cluster, stepper_copy):
+        self.copies = [pickle.loads(pickle.dumps(stepper_copy)) for _ in range(2)]
         Copies.parts = []
 
     def divided(self, method, items, *arguments):
@@ -58,19 +58,19 @@ def two_workers(monkeypatch):
     return stand_in('tcp://10.0.0.1:1', 'tcp://10.0.0.2:1')
 
 
-def require_close(found, wanted):
+def require_close(actual, wanted):
     """By Adam's first moments, which are sums of the steps' gradients.
 
     Adam divides by the root of a mean square. So it moves by a whole step what has a gradient of rounding alone, such as the
     rotation of a sphere.
     """
     for name, values in wanted.state.first.items():
-        np.testing.assert_allclose(found.state.first[name], values, atol=1e-5 * np.abs(values).max(), err_msg=name)
+        np.testing.assert_allclose(actual.state.first[name], values, atol=1e-5 * np.abs(values).max(), err_msg=name)
     for name in 'gradient', 'visits':
-        np.testing.assert_allclose(getattr(found.state, name), getattr(wanted.state, name), rtol=1e-4, atol=1e-7)
-    np.testing.assert_allclose(found.history[-1]['loss'], wanted.history[-1]['loss'], rtol=1e-5)
+        np.testing.assert_allclose(getattr(actual.state, name), getattr(wanted.state, name), rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(actual.history[-1]['loss'], wanted.history[-1]['loss'], rtol=1e-5)
     wanted_images = wanted.render(wanted.nominal_geometry)
-    images = found.render(wanted.nominal_geometry)
+    images = actual.render(wanted.nominal_geometry)
     np.testing.assert_allclose(images, wanted_images, atol=1e-5 * wanted_images.max())
 
 
@@ -79,10 +79,10 @@ def test_the_fit_of_one_process(scan, two_workers):
     method = SHORT.changed(
         batch=3, iterations=4, loss_scale='dynamic', densify_from=0, densify_every=2, densify_threshold=5e-3
     )
-    found, wanted = run(scan, method, cluster=two_workers), run(scan, method)
-    assert len(found.state) == len(wanted.state) > 60
+    actual, wanted = run(scan, method, cluster=two_workers), run(scan, method)
+    assert len(actual.state) == len(wanted.state) > 60
     assert [len(part) for part in Copies.parts] == [2, 1] * 4
-    require_close(found, wanted)
+    require_close(actual, wanted)
 
 
 def test_opacities(scan, two_workers):
@@ -130,6 +130,6 @@ def test_a_worker_is_killed(scan, tmp_path):
 
         with pytest.raises(InputError, match="^worker tcp://.*: No module named 'helpers'; install it there, too"):
             lm.fit(scan, TWO, cluster=address, progress=False)
-        found = lm.fit(scan, method, cluster=address, progress=kill)
+        actual = lm.fit(scan, method, cluster=address, progress=kill)
         assert len(processes()) == 1
-        require_close(found, lm.fit(scan, method, progress=False))
+        require_close(actual, lm.fit(scan, method, progress=False))

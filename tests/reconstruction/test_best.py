@@ -249,9 +249,9 @@ def test_asd_pocs_and_sart_are_candidates_to_the_end(monkeypatch, best):
     monkeypatch.setattr(Best, '_plan', plan)
     for algorithm in (ASDPOCS, SART):
         monkeypatch.setattr(algorithm, '_run', passes)
-    found = run_algorithm(scanned(1)[0], Best())
-    assert [trial.name for trial in found.plan] == ['asd-pocs', 'sart', 'refined']
-    assert found.plan[found.taken].name == best and (found.volume == 1).all()  # its best pass
+    result = run_algorithm(scanned(1)[0], Best())
+    assert [trial.name for trial in result.plan] == ['asd-pocs', 'sart', 'refined']
+    assert result.plan[result.taken].name == best and (result.volume == 1).all()  # its best pass
 
 
 def test_a_prior_is_a_candidate():
