@@ -38,8 +38,8 @@ class Copies:
 
     parts = ()
 
-    def __init__(self, cluster, stepper_copy):
-        self.copies = [pickle.loads(pickle.dumps(stepper_copy)) for _ in range(2)]
+    def __init__(self, cluster, original):
+        self.copies = [pickle.loads(pickle.dumps(original)) for _ in range(2)]
         Copies.parts = []
 
     def divided(self, method, items, *arguments):

@@ -60,15 +60,15 @@ def test_into_a_zarr(tmp_path, scan_yml, monkeypatch, what):
             write(array, index, values)
 
         monkeypatch.setattr(zarr.Array, '__setitem__', counted)
-        found = import_to_zarr(tmp_path / 'views.npy', scan_yml, options, tmp_path / 'b.zarr', False)
+        result = import_to_zarr(tmp_path / 'views.npy', scan_yml, options, tmp_path / 'b.zarr', False)
     monkeypatch.undo()
-    assert found.history == imported.history and found.left_out == imported.left_out
+    assert result.history == imported.history and result.left_out == imported.left_out
     assert max(written) == 4
     scan = scans.read_scan(tmp_path / 'b.zarr').train
     np.testing.assert_array_equal(scan.projections, wanted.projections)
     np.testing.assert_array_equal(scan.valid, wanted.valid)
     assert (scan.stored is None) == (what != 'all pixels are valid') == (tmp_path / 'b.valid.npy').exists()
-    assert scans.history_of(tmp_path / 'b.zarr') == found.history
+    assert scans.history_of(tmp_path / 'b.zarr') == result.history
     np.testing.assert_allclose(scan.geometry.rays().source, wanted.geometry.rays().source)
 
 
