@@ -47,7 +47,7 @@ def test_calls_are_divided(local):
     actors, wanted = Actors(local, Squares()), [(i, i * i + 7) for i in range(5)]
     first, second = (actors.divided('squares', range(5), 7) for _ in range(2))
     assert done(first) == done(second) == wanted
-    assert {worker_id for _, worker_id, _ in first} == {worker_id for _, worker_id, _ in second}
+    assert {object_id for _, object_id, _ in first} == {object_id for _, object_id, _ in second}
     assert len({address for *_, address in second}) == 2
     assert len(actors.divided('squares', [3], 7)) == 1
     with pytest.raises(InputError, match='cannot do'):
