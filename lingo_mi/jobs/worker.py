@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import signal
 import time
 from importlib.metadata import version
@@ -15,11 +16,13 @@ PAUSE = 1.0  # seconds between two reports
 
 
 def dask_setup(dask_worker: Any) -> None:
-    """Ignore Ctrl-C in a worker process of local:N, which Dask preloads with this module.
+    """Ignore Ctrl-C in a worker process of local:N, which Dask preloads with this module, and log nothing there.
 
-    A terminal sends it to all processes. The client alone stops jobs, so that they store their work.
+    A terminal sends Ctrl-C to all processes. The client alone stops jobs, so that they store their work. When it ends, a worker
+    would log that its scheduler is gone. The errors of jobs are sent to the client.
     """
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    logging.disable(logging.ERROR)
 
 
 def describe_worker(folder: str | None, dask_worker: Any) -> dict:
