@@ -208,7 +208,7 @@ class Best(Algorithm):
 
     def steps(self, scan: Scan) -> int:
         more = (2 * TICKS + TESTED if self.cloud else 0) + (TRIED * MOST if self.prior else 0)
-        return 2 * START + TRIAL + 3 * TESTED + 2 * self.niter + more + LONG + SWEEPS
+        return 2 * START + TRIAL + 2 * TESTED + 3 * self.niter + more + LONG + SWEEPS
 
     def grid(self, geometry: Geometry) -> Grid:
         return geometry.grid.finer(self.finer)
@@ -314,7 +314,8 @@ class Best(Algorithm):
         if best.score > LITTLE * best.scores[0]:
             from_ = plan[0] if best.finer == 1 else plain
             smooth = _refined(best.finer, smooth=True)
-            plan.append(self._try(train, held_out, from_, smooth, count))
+            # Its long steps start badly, so that a few passes do not show how good it gets.
+            plan.append(self._try(train, held_out, from_, smooth, count, whole=True))
             best = _best(plan[1:])
         if self.prior is not None:
             strength, volume, scores, _ = self._penalised(None).search(train, held_out, None, count, TRIED * MOST)
