@@ -110,11 +110,11 @@ class ViewsOnWorkers:
         dr.eval(detached)
         values = download(dict(zip(self._names, detached, strict=True)))
         first, *others = self._workers.divided('sums', views, values, batch, iteration)
-        found = sum(others, start=first)
-        for x, gradient in zip(leaf, upload(found.gradients).values()):
+        total = sum(others, start=first)
+        for x, gradient in zip(leaf, upload(total.gradients).values()):
             dr.accum_grad(x, gradient)
-        norms, visits = map(uploaded, found.statistic)
+        norms, visits = map(uploaded, total.statistic)
         statistic.gradient += norms
         statistic.visits += visits
-        loss, factor = [uploaded(x) for x in found.scalars[:, None]] + [None] * (2 - len(found.scalars))
+        loss, factor = [uploaded(x) for x in total.scalars[:, None]] + [None] * (2 - len(total.scalars))
         return loss, factor

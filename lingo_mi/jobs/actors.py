@@ -22,16 +22,16 @@ class Actors:
     ----------
     cluster : Cluster
         The workers.
-    thing
+    resident
         The object, which pickles.
     """
 
-    def __init__(self, cluster: Cluster, thing: Any):
-        self._cluster, self._thing = cluster, thing
+    def __init__(self, cluster: Cluster, resident: Any):
+        self._cluster, self._resident = cluster, resident
         self._actors: dict[str, tuple[Any, Any]] = {}  # Dask's future, which keeps it alive, and the actor, by address
 
     def divided(self, method: str, items: Sequence[Any], *arguments: Any) -> list[Any]:
-        """Call `thing.method(part, *arguments)` on several workers at once, each with a part of the items.
+        """Call `resident.method(part, *arguments)` on several workers at once, each with a part of the items.
 
         Returns
         -------
@@ -71,18 +71,18 @@ class Actors:
         )
 
     def _ready(self, count: int) -> dict[str, Any]:
-        """So many actors, or one for each worker if these are fewer, by address; those that lack are made."""
+        """Return `count` actors, or one for each worker if these are fewer, by address. Missing ones are made."""
         from distributed.protocol.pickle import dumps
 
         client = self._cluster.client
         if not client.nthreads():
             self._cluster.require_workers()
         there = client.nthreads()
-        self._actors = {a: kept for a, kept in self._actors.items() if a in there and kept[0].status == 'finished'}
+        self._actors = {a: pair for a, pair in self._actors.items() if a in there and pair[0].status == 'finished'}
         chosen = sorted(there, key=lambda a: a not in self._actors)[:count]
         if missing := [a for a in chosen if a not in self._actors]:
-            [thing] = client.scatter([dumps(self._thing)], hash=False)
-            arguments = thing, self._cluster.threads, self._cluster.variant
+            [resident] = client.scatter([dumps(self._resident)], hash=False)
+            arguments = resident, self._cluster.threads, self._cluster.variant
             # Other workers: else it would wait for ever for one that has just died.
             futures = {
                 a: client.submit(_Actor, *arguments, workers=[a], allow_other_workers=True, actor=True) for a in missing
@@ -108,13 +108,13 @@ class _Actor:
     """The object on a worker, whose variant and threads are set before the first call."""
 
     def __init__(self, pickled: bytes, threads: int, variant: str | None):
-        self._pickled, self._threads, self._variant, self._thing = pickled, threads, variant, None
+        self._pickled, self._threads, self._variant, self._resident = pickled, threads, variant, None
 
     def call(self, method: str, part: Sequence[Any], *arguments: Any) -> Any:
-        if self._thing is None:  # made here, since Dask calls an actor in another thread than it makes it
-            self._thing = _prepared(self._pickled, self._threads, self._variant)
+        if self._resident is None:  # made here, since Dask calls an actor in another thread than it makes it
+            self._resident = _prepared(self._pickled, self._threads, self._variant)
             self._pickled = b''
-        return getattr(self._thing, method)(part, *arguments)
+        return getattr(self._resident, method)(part, *arguments)
 
 
 def _prepared(pickled: bytes, threads: int, variant: str | None) -> Any:

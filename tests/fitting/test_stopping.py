@@ -100,7 +100,7 @@ def test_the_search_has_the_rates_of_the_fit(scan, monkeypatch):
     """Rates of alpha compositing are in units of the scene's radius, which is slightly different for fewer views."""
     splatting, searched = METHODS['3dgs'].changed(stop='on'), []
 
-    def running(scan, seen, method, seed, stored, search, search_method):
+    def running(scan, seen, method, seed, stored, search, search_method, cluster):
         searched.append(search_method.stepper(seen).method)
         raise KeyboardInterrupt
 
