@@ -153,7 +153,7 @@ class Cluster:
         Raises
         ------
         InputError
-            If none comes, or one cannot do the jobs.
+            If none comes, and if one does not answer or cannot do the jobs.
         """
         try:
             self.client.wait_for_workers(1, timeout=PATIENCE)
@@ -161,7 +161,13 @@ class Cluster:
             raise InputError(
                 f'no worker of the cluster came within {PATIENCE:.0f} s; start some, by `dask worker --nthreads 1`'
             ) from None
-        for worker in self.client.run(describe_worker, self.folder).values():
+        try:
+            workers = self.client.run(describe_worker, self.folder)
+        except OSError as error:
+            raise InputError(
+                f'a worker of the cluster does not answer ({brief(error, 160)}); end it, and run the same command again'
+            ) from None
+        for worker in workers.values():
             require_fit(worker, self.folder, self.variant)
 
 

@@ -79,3 +79,14 @@ def test_a_worker_without_the_backend(client, tmp_path, monkeypatch):
     cluster = Cluster(client, tmp_path, 0, mi.variant(), bar=False)
     with pytest.raises(InputError, match='^slab 0: worker inproc://.*: variant cuda_ad_mono: no NVIDIA GPU'):
         run_or_refuse([Job('slab 0', 1, fills_up, (tmp_path,))], cluster)
+
+
+def test_a_worker_that_hangs(client, monkeypatch):
+    from distributed.comm.core import CommClosedError
+
+    def run(*_, **__):
+        raise CommClosedError('remote=tcp://10.0.0.7:1: Stream is closed')
+
+    monkeypatch.setattr(client, 'run', run)
+    with pytest.raises(InputError, match=r'^a worker .* does not answer \(.*10.0.0.7:1.*; end it, and run the same'):
+        Cluster(client, None, 0, None)
