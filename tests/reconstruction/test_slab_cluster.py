@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 
 import lingo_mi as lm
-from helpers import slab_faults
 from helpers.dask_cluster import cluster, wait_until
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import read_scan, write_scan
@@ -30,6 +29,7 @@ from lingo_mi.storage.file_access import writing
 
 pytest.importorskip('distributed')
 zarr = pytest.importorskip('zarr')
+slab_faults = pytest.importorskip('helpers.slab_faults')  # imports zarr
 SHAPE = 16, 12, 150  # three slabs, the last of which is thinner and of an even number of slices
 
 

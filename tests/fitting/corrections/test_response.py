@@ -51,14 +51,17 @@ def rms(x):
     ],
 )
 def test_what_the_detector_did_is_found(values, changes, within, better):
-    """From 8 views in 600 steps: air of 0.08 to 0.01, gains of 6 % to 1 %. The line integrals are better, too."""
+    """From 8 views in 600 steps: air of 0.05 to 0.01, gains of 4 % to 1 %, root mean square. The line integrals are better, too.
+
+    With five seeds, the root mean square of the gains' errors was 0.3 to 0.7 %, and the largest error 0.6 to 1.9 %.
+    """
     ideal = true_views()
     scan, true = measured(ideal, **values)
     off, on = (run(scan, LONG.changed(n=300, **options), seed=3) for options in ({}, changes))
     actual, expected = on.model.response.report(), true.report()
     for name, limit in within.items():
-        assert np.abs(np.array(actual[name]) - expected[name]).max() < limit, name
-        assert np.abs(expected[name]).max() > 3 * limit
+        assert rms(np.array(actual[name]) - expected[name]) < limit, name
+        assert rms(expected[name]) > 3 * limit
     errors = [rms(f.render(ideal.geometry) - ideal.projections) for f in (off, on)]
     assert errors[1] < better * errors[0]
 
