@@ -46,7 +46,6 @@ TVITER, ALPHA = 10, 0.24  # of the refinement: half as many steps as `Refined`, 
 SMOOTH = 0.5  # alpha of the refinement with more total variation, for noisy scans
 SPREAD = 1.0  # standard deviation of the neighbourhood of a voxel in `error_map`, voxels
 DOUBTFUL = 0.5  # a score above it says that something is wrong; sound scans of 1000 photons a pixel or more reach 0.36
-PLAIN = 'asd-pocs'
 VOXELS = MEANS, VALUES, FINER = 'means', 'values', 'finer'
 TICKS = 20  # steps of the progress for a fit
 
@@ -91,7 +90,7 @@ class Chosen(Reconstruction):
             how = (
                 f'{trial.passes or trial.niter:2} passes' if trial.strength is None else f'strength {trial.strength:g}'
             )
-            output = ''.join(f', {score:.5f} as {kind}' for kind, score in trial.given.items())
+            output = ''.join(f', {score:.5f} as {kind}' for kind, score in trial.outputs.items())
             lines.append(f'{mark} {trial.name:22} voxels {size} mm, {how}: {trial.score:.5f}{output}')
         return '\n'.join(lines)
 
@@ -160,7 +159,7 @@ class Best(Algorithm):
         What a number means if smaller voxels win. 'means': the mean over the voxel's cube, to view, measure and compare.
         'values': the value at its centre, between which projectors interpolate linearly (`voxel_values.values`). 'finer': the
         smaller voxels themselves. If the scan's own voxels win, numbers are values at the centres. The held-out views judge
-        'values' and 'finer' as they are given out, but 'means' by the smaller voxels, because projectors blur even true means.
+        'values' and 'finer' as they are returned, but 'means' by the smaller voxels, because projectors blur even true means.
     prior : Prior, optional
         A prior to try beside the other settings.
 
@@ -244,7 +243,7 @@ class Best(Algorithm):
             )
         result = self._apply(scan, chosen, count, fit)
         assert chosen.volume is not None  # of its best pass
-        tried, volume = (_given(v, chosen.finer, self.voxels) for v in (chosen.volume, result.volume))
+        tried, volume = (_output(v, chosen.finer, self.voxels) for v in (chosen.volume, result.volume))
         if progress is not None:
             progress(self.steps(scan), self.steps(scan), result.residuals[-1])
         for trial in plan:
@@ -268,7 +267,7 @@ class Best(Algorithm):
         """
 
         def error(trial: Trial) -> float:
-            return trial.given.get(VALUES, trial.score) if self.voxels == VALUES else trial.score
+            return trial.outputs.get(VALUES, trial.score) if self.voxels == VALUES else trial.score
 
         def best(trials: list[Trial]) -> Trial:
             return min(trials, key=error) if self.voxels == VALUES else _best(trials)
@@ -277,45 +276,33 @@ class Best(Algorithm):
         if error(refined) < AHEAD * plan[0].score:
             return refined
         if len(plan[0].scores) == START:  # it could go on
-            plan[0] = self._plain(train, held_out, count, LONG)
-        sart = Trial(SART.name, 1)
-        SART(niter=SWEEPS, seed=self.seed)._run(
-            train, progress=count, watch=TrialWatch(Score(held_out), sart, slow=True)
-        )
+            plan[0] = _alone(ASDPOCS(niter=LONG, seed=self.seed), train, held_out, count)
+        sart = _alone(SART(niter=SWEEPS, seed=self.seed), train, held_out, count)
         plan.insert(1, sart)
         chosen = min(best([refined, sart]), plan[0], key=error)
         if chosen is refined or refined.passes <= TESTED or refined.cloud:
             return chosen
-        again = self._try(train, held_out, plan[0], _refined(refined.finer, refined.smooth), count, whole=True)
+        again = self._try(train, held_out, plan[0], _refined(refined.finer, refined.smooth), count, self.niter)
         plan.append(again)
         return min(best([again, sart]), plan[0], key=error)
 
-    def _plain(self, train: Scan, held_out: Scan, count, niter: int) -> Trial:
-        plain = Trial(PLAIN, 1)
-        ASDPOCS(niter=niter, seed=self.seed)._run(
-            train, progress=count, watch=TrialWatch(Score(held_out), plain, slow=True)
-        )
-        return plain
-
     def _plan(self, train: Scan, held_out: Scan, count, fit: Fit | None) -> list[Trial]:
-        plain = self._plain(train, held_out, count, START)
+        plain = _alone(ASDPOCS(niter=START, seed=self.seed), train, held_out, count)
         plan = [plain]
-        scan_voxels = self._try(train, held_out, plain, _refined(1), count, by=TRIAL)
+        scan_voxels = self._try(train, held_out, plain, _refined(1), count, TRIAL)
         plan.append(scan_voxels)
         if self.finer > 1:
-            plan.append(
-                self._try(train, held_out, plain, _refined(self.finer), count, beat=scan_voxels.score, by=TRIAL)
-            )
+            plan.append(self._try(train, held_out, plain, _refined(self.finer), count, beat=scan_voxels.score))
         ahead = any(min(trial.scores[:TRIAL]) < AHEAD * scan_voxels.score for trial in plan[2:])
         if not ahead and scan_voxels.niter == TRIAL < self.niter:  # it was cut short, and may gain from a longer start
-            plan[0] = self._plain(train, held_out, count, LONG)
+            plan[0] = _alone(ASDPOCS(niter=LONG, seed=self.seed), train, held_out, count)
             plan[1] = self._try(train, held_out, plan[0], _refined(1), count)
         best = _best(plan[1:])
         if best.score > LITTLE * best.scores[0]:
             from_ = plan[0] if best.finer == 1 else plain
             smooth = _refined(best.finer, smooth=True)
             # Its long steps start badly, so that a few passes do not show how good it gets.
-            plan.append(self._try(train, held_out, from_, smooth, count, whole=True))
+            plan.append(self._try(train, held_out, from_, smooth, count, self.niter))
             best = _best(plan[1:])
         if self.prior is not None:
             strength, volume, scores, _ = self._penalised(None).search(train, held_out, None, count, TRIED * MOST)
@@ -341,21 +328,19 @@ class Best(Algorithm):
 
         return fit(scan, progress)(scan.geometry.grid.finer(finer))
 
-    def _try(self, train, held_out, start: Trial, trial: Trial, count, beat=None, by=0, whole=False) -> Trial:
-        """Refine the volume of another trial."""
+    def _try(self, train, held_out, start: Trial, trial: Trial, count, niter=TESTED, beat=None) -> Trial:
+        """Refine the volume of another trial, by `niter` passes at most. beat: as for `TrialWatch`."""
         assert start.volume is not None  # of its best pass
-        trial.before = start.niter if start.name == PLAIN else 0
+        trial.before = start.niter if start.name == ASDPOCS.name else 0
         score = Score(held_out.on(held_out.geometry.grid.finer(trial.finer)))
-        niter = self.niter if whole else min(by if by and beat is None else TESTED, self.niter)
-        refine(
-            train, start.volume, niter, trial.finer, trial.smooth, self.seed, count, TrialWatch(score, trial, beat, by)
-        )
+        niter, watch = min(niter, self.niter), TrialWatch(score, trial, beat, TRIAL)
+        refine(train, start.volume, niter, trial.finer, trial.smooth, self.seed, count, watch)
         if len(trial.scores) == TESTED < trial.niter + PATIENCE:
             trial.passes = self.niter
         if trial.finer > 1:
             score, volume = Score(held_out), trial.volume
             assert volume is not None
-            trial.given = {kind: score(uploaded(_given(volume, trial.finer, kind))) for kind in (MEANS, VALUES)}
+            trial.outputs = {kind: score(uploaded(_output(volume, trial.finer, kind))) for kind in (MEANS, VALUES)}
         return trial
 
     def _apply(self, scan: Scan, trial: Trial, count, fit: Fit | None) -> Reconstruction:
@@ -369,7 +354,7 @@ class Best(Algorithm):
             start = self._cloud(scan, trial.finer, fit, count)
         else:
             plain = ASDPOCS(niter=trial.before or trial.niter, seed=self.seed)._run(scan, progress=count)
-            if trial.name == PLAIN:
+            if trial.name == ASDPOCS.name:
                 return plain
             start = plain.volume
         return refine(scan, start, trial.passes or trial.niter, trial.finer, trial.smooth, self.seed, count)
@@ -427,6 +412,13 @@ def _best(trials: Sequence[Trial]) -> Trial:
     return min(trials, key=lambda trial: trial.score * (MARGIN if trial.finer == 1 else 1))
 
 
+def _alone(algorithm: ASDPOCS | SART, train: Scan, held_out: Scan, count) -> Trial:
+    """Try an algorithm from an empty volume on the scan's voxels."""
+    trial = Trial(algorithm.name, 1)
+    algorithm._run(train, progress=count, watch=TrialWatch(Score(held_out), trial, slow=True))
+    return trial
+
+
 def error_map(volume: np.ndarray, fewer: np.ndarray) -> np.ndarray:
     """Return a map of the uncertainty of a volume: its difference from a volume of fewer views, root mean square around each
     voxel.
@@ -438,8 +430,8 @@ def error_map(volume: np.ndarray, fewer: np.ndarray) -> np.ndarray:
     return np.sqrt(np.maximum(square, 0))
 
 
-def _given(volume: np.ndarray, finer: int, voxels: str) -> np.ndarray:
-    """The numbers that are given out for a volume (`Best.voxels`)."""
+def _output(volume: np.ndarray, finer: int, voxels: str) -> np.ndarray:
+    """The numbers that are returned for a volume (`Best.voxels`)."""
     if finer == 1 or voxels == FINER:
         return volume
     return means(volume, finer) if voxels == MEANS else values(means(volume, finer))

@@ -77,8 +77,8 @@ class Trial:
         `Score` of the held-out views after every pass; of a prior, of every strength.
     volume : ndarray or None
         After the pass with the lowest score, on the setting's own voxels.
-    given : dict[str, float]
-        `Score` of the numbers that would be given out for smaller voxels: of their 'means' and 'values' (`Best.voxels`).
+    outputs : dict[str, float]
+        `Score` of the numbers that would be returned for smaller voxels: of their 'means' and 'values' (`Best.voxels`).
     strength : float or None
         Strength of a prior, else None.
     before : int
@@ -93,7 +93,7 @@ class Trial:
     cloud: bool = False
     scores: list[float] = field(default_factory=list)
     volume: np.ndarray | None = None
-    given: dict[str, float] = field(default_factory=dict)
+    outputs: dict[str, float] = field(default_factory=dict)
     strength: float | None = None
     before: int = 0
     passes: int = 0
@@ -116,7 +116,7 @@ class Trial:
             niter=self.niter,
             score=self.score,
             scores=self.scores,
-            given=self.given,
+            outputs=self.outputs,
             strength=self.strength,
             before=self.before,
             passes=self.passes or self.niter,

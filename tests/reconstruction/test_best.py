@@ -215,8 +215,8 @@ def test_values_predict_views_and_means_the_truth(finer_scan):
     on_scan = scan.geometry.grid
     assert missed(values(truth), on_scan) < missed(truth, on_scan)  # so the projections of means do not judge them
     finer = [trial for trial in results['means'].plan if trial.finer == 2]
-    assert all(trial.given['values'] < trial.given['means'] for trial in finer)
-    assert f'{finer[0].given["means"]:.5f} as means' in results['means'].report()
+    assert all(trial.outputs['values'] < trial.outputs['means'] for trial in finer)
+    assert f'{finer[0].outputs["means"]:.5f} as means' in results['means'].report()
     np.testing.assert_allclose(means(results['finer'].volume, 2), results['means'].volume, rtol=1e-5, atol=1e-7)
 
 
