@@ -40,6 +40,7 @@ LONG, SWEEPS = 50, 20  # passes of ASD-POCS and of SART, at most, if they are th
 AHEAD = 0.9  # times another score: below it a setting is clearly ahead, whatever passes the other one still gets
 TESTED = 8  # passes of a refinement that are tried: if the last of them still gain, noise does not limit their number
 MARGIN = 1.02  # how much better the scan's own voxels must be than smaller ones, see `Best`
+PLAIN = 1.015  # how much better ASD-POCS and SART must be than a refinement, see `Best`
 LITTLE = 0.95  # times the score after one pass of a refinement: if more passes gain less, noise limits them
 LMBDA, LMBDA_RED = 1.8, 0.97  # of the refinement: long steps converge sooner, and shorten before they take up the noise
 TVITER, ALPHA = 10, 0.24  # of the refinement: half as many steps as `Refined`, twice as long, are as good in less time
@@ -141,7 +142,8 @@ class Best(Algorithm):
 
     Smaller voxels suit objects finer than the voxels, because the scan's voxels turn such detail into streaks. Streaks lie along
     the views of the reconstruction, and held-out views hardly show them. The scan's own voxels must therefore be better by
-    `MARGIN`.
+    `MARGIN`. `SART` and `ASDPOCS`, which leave more streaks and noise than a refinement, must be better by `PLAIN`, unless
+    `voxels` is 'values', whose purpose is to predict views.
 
     Parameters
     ----------
@@ -272,19 +274,24 @@ class Best(Algorithm):
         def best(trials: list[Trial]) -> Trial:
             return min(trials, key=error) if self.voxels == VALUES else _best(trials)
 
+        margin = 1 if self.voxels == VALUES else PLAIN
+
+        def choice(refined: Trial) -> Trial:
+            plain = min(plan[:2], key=error)
+            return refined if error(refined) < margin * error(plain) else plain
+
         refined = best([trial for trial in plan[1:] if trial.volume is not None])
         if error(refined) < AHEAD * plan[0].score:
             return refined
         if len(plan[0].scores) == START:  # it could go on
             plan[0] = _alone(ASDPOCS(niter=LONG, seed=self.seed), train, held_out, count)
-        sart = _alone(SART(niter=SWEEPS, seed=self.seed), train, held_out, count)
-        plan.insert(1, sart)
-        chosen = min(best([refined, sart]), plan[0], key=error)
+        plan.insert(1, _alone(SART(niter=SWEEPS, seed=self.seed), train, held_out, count))
+        chosen = choice(refined)
         if chosen is refined or refined.passes <= TESTED or refined.cloud:
             return chosen
         again = self._try(train, held_out, plan[0], _refined(refined.finer, refined.smooth), count, self.niter)
         plan.append(again)
-        return min(best([again, sart]), plan[0], key=error)
+        return choice(again)
 
     def _plan(self, train: Scan, held_out: Scan, count, fit: Fit | None) -> list[Trial]:
         plain = _alone(ASDPOCS(niter=START, seed=self.seed), train, held_out, count)
