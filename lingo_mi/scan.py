@@ -60,14 +60,14 @@ class Scan:
     geometry : Geometry
         In mm.
     projections : float32 [view, v, u]
-        Line integrals ln(I0 / I), density times mm. Of `StoredViews`, `views` reads those that are asked for, and `projections`
-        reads all and keeps them.
+        Line integrals ln(I0 / I), density times mm. If they are `StoredViews`, `views` reads only the views that it is asked
+        for, and `projections` reads all and keeps them.
     valid : ndarray or None
-        Bool [view, v, u], where pixels must be left out (dead ones, metal, a collimator's shadow); None: all are valid. What the
-        projections hold in the others, NaN included, is forgotten: they become 0.
+        Bool [view, v, u], False for pixels to leave out (dead ones, metal, a collimator's shadow); None: all are valid. The
+        projections become 0 in pixels that are left out, even if they were NaN.
     effects : PixelEffects or None
-        Effects of a detector besides line integrals (`effects.forward.Effects`); None: nothing. The projections are then -ln of
-        its signal, and densities attenuation at the tube's reference energy.
+        Effects of a detector besides line integrals (`effects.forward.Effects`), or None. With effects, the projections are -ln
+        of the detector's signal, and densities are attenuation at the tube's reference energy.
 
     Raises
     ------
@@ -344,7 +344,7 @@ def values_digest(volume: np.ndarray) -> str:
 class Dataset:
     """Content of a scan's file: views to fit, views held out, and the true volume [x, y, z], densities in 1/mm.
 
-    The volume may be an array of any library that has `__array__` or `__dlpack__`; InputError if it is none.
+    The volume may be an array of any library that has `__array__` or `__dlpack__`. Anything else raises InputError.
 
     Examples
     --------

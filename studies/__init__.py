@@ -2,7 +2,6 @@
 
 Each is a command, `python -m studies.NAME --help`:
 
-- `as_csv`: tables of pages as data
 - `as_csv`: the tables of a page that a study has written, as data
 - `bench_recon`: reconstruction on voxels, timed beside RTK and diffct
 - `bench_step`: a step of a fit, timed part by part

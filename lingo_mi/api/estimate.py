@@ -79,10 +79,10 @@ def estimate(
     Returns
     -------
     Estimate
-        `lm.reconstruct`, `lm.fit` and the commands refuse work by the same `memory`. `seconds` is a range, because later steps
-        may take 0.7 to 1.5 times as long as the tried ones. In fits, `Best` and `PenalisedLeastSquares`, whose steps change, the
-        factor is 0.3 to 4. A trial waits for the device after every step, so steps of a few milliseconds look slower than they
-        are. Work that ends within the trial gives its exact time.
+        `lm.reconstruct`, `lm.fit` and the commands use the same `memory` to refuse work. `seconds` is a range, because later
+        steps may take 0.7 to 1.5 times as long as the tried ones. In fits, `Best` and `PenalisedLeastSquares`, whose steps
+        change, the factor is 0.3 to 4. A trial waits for the device after every step, so steps of a few milliseconds look
+        slower than they are. Work that ends within the trial gives its exact time.
 
     Raises
     ------

@@ -6,8 +6,9 @@
     lingo-mi accuracy --presets --variant cuda_ad_mono --out out/cuda
     lingo-mi accuracy --presets --beside out/cuda/accuracy.json
 
-Writes accuracy.json, accuracy.md and the plots to --out, and to accuracy.provenance.json how they were made. The full run takes
-6 to 15 minutes on two cores, --quick under 3. With --docs, the plots go there, and conditions and presets into a page there, too.
+It writes accuracy.json, accuracy.md and the plots to --out, and records in accuracy.provenance.json how they were made. The
+full run takes 6 to 15 minutes on two cores, --quick under 3. With --docs, the plots go to that folder, and conditions and
+presets into a page there.
 
 --presets measures the table of the presets alone, which needs no ray tracing. --beside adds another variant's errors to it.
 """

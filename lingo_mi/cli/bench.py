@@ -3,14 +3,13 @@
     lingo-mi bench
     lingo-mi bench --gaussians 50000 --size 512 --extent 3 --json bench.json
 
-Renders a random cloud through mi.render and differentiates it through dr.backward, Python and set-up included, and runs
-limit.cpp of lingo_mi.validation (AVX2, two threads, nothing but the arithmetic of a pixel in a fixed box) on as many
-pairs, in turn, so that both see the same machine; the best of five counts for both, and the median of all turns is printed. A
-pair is a pixel in the bounding box of a Gaussian's footprint. The limit needs g++.
+It renders a random cloud through mi.render and differentiates it through dr.backward, Python and set-up included. In turn, so
+that both see the same machine, it runs limit.cpp of lingo_mi.validation on as many pairs (AVX2, two threads, nothing but the
+arithmetic of a pixel in a fixed box). In each turn the best of five tries counts, and medians of all turns are printed. A pair
+is a pixel in the bounding box of a Gaussian's footprint. The limit needs g++.
 
-Then, once, the same cloud and image by marching through the tree of `ellipsoids`, hit by hit, and both ways' errors
-against float64 on some of the pixels. That takes a minute; --no-bvh leaves it out. Numbers that were not measured are null in
-the JSON.
+Then it computes the same image once by marching through the tree of `ellipsoids`, hit by hit, and compares both with float64 on
+some of the pixels. That takes a minute; --no-bvh leaves it out. Numbers that were not measured are null in the JSON.
 """
 
 import argparse

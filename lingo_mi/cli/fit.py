@@ -9,7 +9,7 @@ The scene says what is scanned and by which scanner; the projections are rendere
 projections replaces the scene. With --projections, it replaces only the object, and the scene's tube and detector are modelled.
 A cloud is started from the projections, fitted, and written to the output folder with a report (report.html), a volume in mm
 (volume.nii.gz), the Gaussians (gaussians.ply), a scene of them (result.xml), held-out views and metrics.json. The baselines
-3dgs and xgaussian make neither volume nor scene; naf makes no Gaussians, and a scene of its volume.
+3dgs and xgaussian make neither volume nor scene. naf makes no Gaussians, and its scene holds its volume.
 """
 
 import argparse
@@ -44,8 +44,8 @@ def parser() -> Parser:
         '--method',
         default='fast',
         metavar='M',
-        help='fast (default), the published lingo and r2, or the baselines 3dgs and xgaussian, which '
-        'composite opacities and make views but no volume, and naf, a neural field; M:option=value,... changes it',
+        help='fast (default), the published lingo or r2, naf (a neural field), or the baselines 3dgs and xgaussian, which '
+        'composite opacities and make views but no volume; M:option=value,... changes options',
     )
     p.add_argument('--views', type=int, metavar='N', help='fit N evenly spaced views (default: all)')
     p.add_argument(
@@ -59,7 +59,7 @@ def parser() -> Parser:
     p.add_argument(
         '--start',
         metavar='S',
-        help='where the Gaussians start: edges of a volume of SART (edges), Otsu masks (masks) or an FDK volume (fdk); of 3dgs '
+        help='where the Gaussians start: edges of a volume of SART (edges), Otsu masks (masks) or an FDK volume (fdk); for 3dgs '
         'and xgaussian also random points (random) or a regular grid (cuboid)',
     )
     p.add_argument('--out', type=Path, metavar='D', help='output folder (default: out/<scene>)')

@@ -30,8 +30,8 @@ examples:
 
 The scan is X3D's: a cone beam, DSD 1500 mm, DSO 1000 mm, 512 x 512 pixels of 1 mm (1.48 mm for the chest),
 training views evenly over [0, 180) degrees and as many random ones held out. Values are densities in [0, 1]
-and line integrals in density times mm, larger than any scanner measures; --attenuation real makes them those
-of dense bone, per mm. shepp_logan, gaussians and mesh are projected exactly, foot and chest as trilinear
+and line integrals in density times mm, larger than any scanner measures; --attenuation real scales them to
+dense bone, per mm. shepp_logan, gaussians and mesh are projected exactly, foot and chest as trilinear
 voxels."""
 
 SUMMARY = {

@@ -11,20 +11,19 @@
     lingo-mi reconstruct x3d_foot --algorithm best --views 25 --report foot.html
 
 The input is the same as for `lingo-mi fit`. With --complete, the volume is made from the fitted views and from views that the
-fit renders, --views in all. The scan must be on a circle, before an upright panel, with every pixel. refined is the best for
+fit renders, --views in all. The scan must be on a circle, with an upright panel and no invalid pixel. refined is the best for
 few clean views: it starts from the fit's volume, and fits all views first and then the measured ones. For objects finer than
 the voxels add -D finer=2. With --start, refined or an iterative algorithm starts from the fit's volume and uses the fitted
 views; any scan will do. All but fdk use the poses that the fit has corrected. If the true volume is known, PSNR and SSIM are
-printed, with its largest density for full scale, then with 1. best chooses its settings by measured views that it holds out,
+printed twice: the full scale is its largest density, and then 1. best chooses its settings by measured views that it holds out,
 and needs no fit; with -D cloud=true it also fits a cloud, and tries to start from it. Its trials are printed, and written
 beside the volume V.nii.gz as V-plan.json. V-error.nii.gz shows where the volume is least certain, and is a layer of the page
 that --report writes. Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D
 effects=ignore is given. With --complete and --start, these are the effects that the fit has modelled.
 
-A volume larger than memory is made and written in slabs of --slab slices, by fdk, sart, os-sart, sirt, asd-pocs and voxelize. The
-iterative ones hold it in a folder beside it, with the name of the volume and .slabs, until it is written. If they are
-stopped, the same command goes on. With --cluster, workers make the slabs and write them to an .ome.zarr; they must see its
-folder.
+A volume larger than memory is made and written in slabs of --slab slices, by fdk, sart, os-sart, sirt, asd-pocs and voxelize.
+Until it is written, the iterative ones hold it in a folder beside it, whose name ends in .slabs. If they are stopped, the same
+command goes on. With --cluster, workers make the slabs and write them to an .ome.zarr; they must see its folder.
 """
 
 import argparse

@@ -112,7 +112,7 @@ class FittedModel:
     ) -> np.ndarray:
         """Projections in the views of any geometry (default: the scan's), float32 [view, v, u], density times mm.
 
-        They are line integrals, or, if the fit has modelled effects, what the scan's detector would see, noise apart.
+        They are line integrals, or, if the fit has modelled effects, what the scan's detector would see without noise.
         """
         return self.model.render(self._device, self._checked(geometry, self.geometry), progress)
 

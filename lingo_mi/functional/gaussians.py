@@ -30,7 +30,7 @@ class Gaussians:
     scales : array
         Standard deviations, mm, float [N, 3].
     quaternions : array
-        (x, y, z, w), float [N, 4]. Those of a fit have unit length.
+        (x, y, z, w), float [N, 4]. A fit's quaternions have unit length.
     density : array
         Values at the centres, 1/mm, float [N]; opacities for `GaussianSplatting` and `XGaussian`.
     extent : float

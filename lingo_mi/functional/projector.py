@@ -46,8 +46,8 @@ class Projector(LinearMap):
         The scanner and the grid of the volume.
     model : {'joseph', 'exact'}
         'joseph' interpolates in the slices of voxel centres (error about 0.5 % of the line integrals). 'exact' integrates the
-        trilinear interpolant exactly, and takes three to four times as long. If the source is beside or inside the volume, the
-        model is always 'exact'.
+        trilinear interpolant exactly, and takes 2 to 8 times as long. If the source is beside or inside the volume, the model
+        is always 'exact'.
     views : slice or sequence of int, optional
         Views of the geometry (default: all).
     valid : array of bool, optional

@@ -71,7 +71,7 @@ class Geometry(ABC):
     mode : str
         'cone' or 'parallel'.
     nDetector : [2]
-        Pixels (v, u), rows and columns, at least 1.
+        Pixels (v, u), rows and columns, at least 1. One number here, in dDetector or offDetector holds for both axes.
     dDetector : [2]
         Pixel size, (v, u), mm.
     grid : Grid
@@ -85,7 +85,7 @@ class Geometry(ABC):
     ------
     InputError
         For wrong shapes, numbers that are not finite or beyond the limits of `lingo_mi.geometry.limits`, and sizes and counts
-        that are not positive. nDetector, dDetector and offDetector may be one number for both axes.
+        that are not positive.
 
     Examples
     --------

@@ -89,10 +89,10 @@ class Rays:
         return np.stack(self._arrays(), 1)
 
     def by_motion(self, by_vectors: ArrayLike) -> np.ndarray:
-        """Derivatives by a rigid motion of each view, [n, 6], of a number whose derivatives by `vectors` are [n, 4, 3].
+        """Derivatives by a rigid motion of each view, [n, 6], from the derivatives of a number by `vectors`, [n, 4, 3].
 
-        The first three are by a turn about the origin, a rotation vector in radians; the others by a shift. If all views
-        move together, sum over them.
+        The first three are by a turn about the origin, a rotation vector in radians, and the others by a shift. Sum over the
+        views if they all move together.
 
         Examples
         --------

@@ -40,8 +40,8 @@ class ASDPOCS(Algorithm):
     `alpha_red` whenever the descent changes the volume by more than `rmax` times the change by P.
 
     It stops when the data are matched and both parts of a pass cancel (cosine below -0.99), or when lmbda falls below 0.005.
-    The volume is that after descent, as in TIGRE; the residuals are those before it, of the passes where they decide anything
-    and of the last one.
+    The volume is taken after the descent, as in TIGRE, and residuals before it. They are computed in the passes that need them,
+    and in the last one.
 
     Use it for few views of objects with large uniform regions. For noisy projections, maxl2err sets how closely to match them.
 

@@ -29,18 +29,19 @@ FLOOR = 0.05  # least weight, relative to the root mean square of all
 
 @dataclass(frozen=True)
 class Refined(Algorithm):
-    """SART on views completed from a cloud, then ASD-POCS on the measured ones alone, both from the cloud's own volume.
+    """SART on views completed from a cloud, then ASD-POCS on the measured views, starting from the cloud's own volume.
 
-    Rendered views are accurate except where no measured view constrains them. They are fitted first; the measured views then
-    correct their errors. A pass P over the completed or the measured views weights the voxels by the `structure` s of the
+    Rendered views are accurate except in places that no measured view constrains. They are fitted first, and the measured views
+    then correct their errors. A pass P over the completed or the measured views weights the voxels by the `structure` s of the
     volume V that it starts from. If pixels are wider than voxels, a blur G (`excess_width`) smooths the change to the pixels'
     width:
 
         x  <-  x + lmbda s (A_b^T W (b - A_b x)) / (A_b^T 1),  W = 1 / (A_b s),  s = root mean square gradient of V
         x  <-  max(x + G (P(x) - x), 0)
 
-    since a cloud errs at edges and hardly in uniform regions. The TV steps start long and shorten until they change the volume
-    by `rmax` of what the data steps do. The projections are corrected for the error of Joseph's projector (`exact_every`).
+    The weights follow s, because a cloud errs at edges and hardly in uniform regions. TV steps start long, and shorten until
+    they change the volume by `rmax` times the change by the data steps. The projections are corrected for the error of Joseph's
+    projector (`exact_every`).
 
     Structure finer than the voxels causes streaks. A cloud can be sampled on smaller voxels: with `finer`, all steps use these,
     and the result is their mean over each voxel. This helps for clean projections of objects finer than the voxels. It blurs

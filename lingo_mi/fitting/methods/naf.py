@@ -26,10 +26,10 @@ BYTES = 32  # for each parameter of a field: its moments, its derivatives and co
 class NAF(Method):
     """NAF with its released settings of the chest: 1500 passes over 50 views, and the mean squared error of single rays.
 
-    The rates step down to a tenth in the paper, and not at all in these released settings; here they fall to it log-linearly.
-    Rays are sampled within the volume alone, there between two distances that are the same for all rays and reach beyond it. Its
-    lengths are metres, and Adam's epsilon is 1e-8. In the normalised frame of a volume of 256 mm the gradients are
-    (1000 * 2 / 256)^2 = 61 times as large, and so is epsilon. The unit of density and the start differ from NAF's.
+    Rates here fall to a tenth log-linearly. They step down to it in the paper, and stay constant in the released ones. Rays are
+    sampled within the volume alone, but in NAF between two distances that are the same for all rays and reach beyond the
+    volume. NAF's lengths are metres, and its epsilon of Adam is 1e-8. In the normalised frame of a volume of 256 mm, gradients
+    are (1000 * 2 / 256)^2 = 61 times as large, and so is epsilon. The unit of density and the start differ, too.
 
     Parameters
     ----------

@@ -82,8 +82,8 @@ class Loss(ImageLoss):
     tv_stride : int
         Voxels between samples (R2-Gaussian: 1). 2 smooths eight times the volume at the same cost.
     tv_views : int
-        Views up to which `lambda_tv` holds. A scan of n views, if these are more, has lambda_tv tv_views / n, so that more data
-        do not have more total variation beside them. 0: `lambda_tv` holds for any number.
+        Number of views up to which `lambda_tv` holds. The weight for n views, if these are more, is lambda_tv tv_views / n,
+        because more data need less total variation. 0: `lambda_tv` holds for any number.
     loss_scale : {'none', 'dynamic', 'statistic'}
         'dynamic': LINGO's factor T_g + 1 / (4 T_g) on the whole loss. 'statistic': the same factor on the densification
         statistic alone, since Adam cancels a constant factor of the loss.

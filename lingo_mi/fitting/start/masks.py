@@ -54,10 +54,9 @@ class MaskStart(NumberedStart):
         How to count a cell that projects outside a view's image; see `voxel_filter.valid_voxels`. 'invalid' is the paper's,
         'ignore' serves truncated scans, 'auto' is 'ignore' if the object reaches the edge of the panel in some view.
     density : {'lsq', 'paper', 'r2', 'fdk'}
-        The factor on the mean pixel: 'paper' takes 1, 'r2' the 0.15 that R2-Gaussian puts on FDK densities, and 'lsq' the factor
-        that fits the projections best.
-        'fdk' takes an FDK volume at the point in place of the mean pixel, times a factor as 'lsq' does; a scan that FDK cannot
-        reconstruct has 'lsq' instead.
+        The factor on the mean pixel: 'paper' takes 1, 'r2' the 0.15 that R2-Gaussian puts on FDK densities, and 'lsq' the
+        factor that fits the projections best. 'fdk' replaces the mean pixel by the density of an FDK volume at the point, and
+        fits the factor as 'lsq' does. Scans that FDK cannot reconstruct get 'lsq' instead.
 
     Examples
     --------

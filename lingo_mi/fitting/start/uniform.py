@@ -21,7 +21,7 @@ MOST_POINTS = 4e6  # of a cuboid
 class RandomStart(NumberedStart):
     """Points drawn uniformly from the volume. 3DGS without a point cloud draws 100,000 from a cube around the scene.
 
-    Of a fan beam, all points lie in the plane z = 0.
+    In a fan beam, all points lie in the plane z = 0.
 
     Parameters
     ----------
