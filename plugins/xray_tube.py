@@ -49,8 +49,9 @@ class XRayTube(mi.Emitter):
          second; its share rises linearly between.
      * - bands
        - |int|
-       - Terms of the sum that stands for the spectrum, 1 to 6. With 5, measured values up to 10 are right to 5e-6 for water,
-         4e-4 for bone and 5e-3 for iron (120 kVp). (Default: 5)
+       - Terms of the sum that stands for the spectrum, 1 to 6. With 5, values up to 10 of a detector of energy are right to
+         5e-6 for water, 4e-4 for bone and 5e-3 for iron (120 kVp). A detector of counts has up to twice these errors.
+         (Default: 5)
      * - focal_spot
        - |string|
        - Width and height of the focal spot in mm, along the panel's u and v; one number stands for both. A uniform
