@@ -263,6 +263,35 @@ def test_asd_pocs_and_sart_are_candidates_to_the_end(monkeypatch, best, score, v
     assert result.plan[result.taken].name == winner and (result.volume == 1).all()  # its best pass
 
 
+@pytest.mark.parametrize(
+    'own, finer, passes',
+    [
+        ([0.60, 0.51, 0.40], [0.50, 0.49], [20, 8]),  # the scan's own voxels overtake
+        ([0.60, 0.51, 0.45], [0.50, 0.49, 0.30], [20, 20]),  # and the smaller ones, which still gain, get theirs
+        ([0.60, 0.51, 0.505], [0.50, 0.49, 0.30], [20, 8]),  # they do not
+        ([0.60, 0.56, 0.40], [0.50, 0.49], [8, 8]),  # they are too far behind
+        ([0.50, 0.45], [0.60, 0.46], [8, 8]),  # they are ahead anyway
+    ],
+)
+def test_who_is_a_little_behind_and_still_gains_gets_all_passes(monkeypatch, own, finer, passes):
+    """Scores are after one pass, after 8, and after 20; two of them: the last passes gain nothing."""
+
+    def tried(self, train, held_out, start, trial, count, niter=8, beat=None):
+        first, eighth, *last = own if trial.finer == 1 else finer
+        trial.scores, trial.passes = [first] * 7 + [eighth], 20 if last else 8
+        if niter == 20:
+            trial.scores += [*([eighth] * 11), *(last or [eighth])]
+        return trial
+
+    monkeypatch.setattr(Best, '_try', tried)
+    monkeypatch.setattr(
+        'lingo_mi.reconstruction.best._alone', lambda *args: Trial('asd-pocs', 1, scores=[1.0], volume=np.zeros(1))
+    )
+    scan, _ = scanned(1)
+    plan = Best()._plan(scan, scan, None, None)
+    assert [len(trial.scores) for trial in plan[1:3]] == passes
+
+
 def test_a_prior_is_a_candidate():
     scan, _ = scanned(1, 300.0)
     result = run_algorithm(scan, Best(niter=2, finer=1, prior=lm.TV()))
