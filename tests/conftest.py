@@ -65,7 +65,7 @@ def phantoms_made_once():
 
 @pytest.fixture
 def sums_in_order(variant) -> None:
-    """Skips if additions are in another order than in the program."""
+    """Skip the test if additions are in another order than in the program."""
     if adds_in_any_order():
         pytest.skip('a GPU adds atomically, in any order')
 
@@ -78,7 +78,7 @@ def no_report(monkeypatch) -> None:
 
 @pytest.fixture(scope='session')
 def data() -> Path:
-    """The folder of test volumes that LINGO_MI_DATA names; skips where it names none."""
+    """The folder of test volumes that LINGO_MI_DATA names; tests are skipped if it names none."""
     folder = os.environ.get('LINGO_MI_DATA')
     if not folder or not Path(folder).is_dir():
         pytest.skip('LINGO_MI_DATA names no folder of test volumes')

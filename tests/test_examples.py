@@ -39,7 +39,7 @@ def test_there_are_examples():
 
 @pytest.mark.parametrize('path', [marked(path) for path in EXAMPLES])
 def test_example(path, variant, monkeypatch, tmp_path):
-    """Without an error, with something to see in each, and without a warning of matplotlib or NumPy."""
+    """Each example runs with something to see, without an error, and without a warning of matplotlib or NumPy."""
     for module in NEEDS.get(path.stem, ()):
         optional = pytest.importorskip(module)
         if module == 'torch' and variant.startswith('cuda') and not optional.cuda.is_available():
@@ -63,7 +63,7 @@ def test_example(path, variant, monkeypatch, tmp_path):
 
 
 def test_the_notebook_is_the_first_tutorial():
-    """With its outputs, but for a first cell that installs the package; `python docs/make_notebook.py` makes it."""
+    """It has outputs, and a first cell that installs the package; `python docs/make_notebook.py` makes it."""
     path = EXAMPLES[0].with_name('first_fit.ipynb')
     cells = [cell for cell in json.loads(path.read_text(encoding='utf-8'))['cells'] if cell['cell_type'] == 'code']
     assert 'pip install' in ''.join(cells[0]['source'])

@@ -86,7 +86,7 @@ CONDA = {'openexr': 'openexr-python', 'matplotlib': 'matplotlib-base'}
 
 
 def test_conda_takes_what_pip_takes():
-    """But LLVM, which conda's drjit brings."""
+    """The exception is LLVM, which conda's drjit brings."""
     recipe = yaml.safe_load((ROOT / '.github' / 'conda' / 'recipe.yaml').read_text())
     named = re.search(r'^dependencies = \[\n(.*?)^\]', (ROOT / 'pyproject.toml').read_text(), re.MULTILINE | re.DOTALL)[
         1

@@ -158,7 +158,7 @@ def test_views_say_nothing_behind_invalid_pixels(scan, outside, misses):
 
 
 def test_densities_come_from_valid_pixels(scan):
-    """Whatever stands in the others, the cloud is the same."""
+    """The cloud is the same, whatever stands in the other pixels."""
     g, valid, clouds = scan.geometry, patches(scan), []
     for value in (0, 1e6):
 

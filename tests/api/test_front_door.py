@@ -200,7 +200,7 @@ def test_undershoots_are_no_hounsfield_units(geometry):
 
 
 def test_where_nothing_can_be_written(result, data, tmp_path, monkeypatch):
-    """A file where a folder is needed: one line, for a fit before it starts."""
+    """A file in the place of a folder gives one line, before a fit starts."""
     (tmp_path / 'file').write_text('')
     monkeypatch.setattr('lingo_mi.api.fitting.run', None)
     for write in lambda folder: lm.fit(data, folder=folder, progress=False, **TINY), result.save:
@@ -213,7 +213,7 @@ def test_where_nothing_can_be_written(result, data, tmp_path, monkeypatch):
 
 @pytest.mark.parametrize('name', ['checkpoint.npz', 'metrics.json', 'volume.nii.gz', 'notes.txt'])
 def test_a_fit_overwrites_nothing(data, tmp_path, monkeypatch, name):
-    """Neither without force=True, nor with it what is of another program, or where a link leads."""
+    """Without force=True a fit overwrites nothing; with it, other programs' files and the targets of links stay."""
     monkeypatch.setattr('lingo_mi.api.fitting.run', None)
     (tmp_path / 'out').mkdir()
     (tmp_path / 'out' / name).write_text('mine')
@@ -352,7 +352,7 @@ def test_reconstruct(data, result):
 
 
 def test_reconstruct_into_a_file(data, result, tmp_path):
-    """Whole or in slabs: the same volume, and nothing is left beside it."""
+    """The volume is the same whole or in slabs, and no working file is left beside it."""
     for name, algorithm, options in (
         ('sart', lm.SART(niter=2), {}),
         ('fdk', lm.FDK(), dict(start=result, views=12)),
@@ -406,7 +406,7 @@ def test_examples_of_the_docstrings_name_what_exists():
 
 @pytest.mark.thorough
 def test_a_result_with_modelled_effects_is_loaded(tmp_path):
-    """A checkpoint does not keep them; the result.xml beside it does."""
+    """A checkpoint does not keep the effects, but the result.xml beside it does."""
     sizes = dict(pixels=24, pixel_size=12, voxels=16, voxel_size=2.4)
     data = lm.simulate('effects/focal_spot', views=6, parameters=sizes, progress=False)
     result = lm.fit(data, 'fast', iterations=5, n_points=100, progress=False)
@@ -420,7 +420,7 @@ def test_a_result_with_modelled_effects_is_loaded(tmp_path):
 
 @pytest.mark.parametrize('change', [dict(dVoxel=16.0), dict(offOrigin=(30.0, 0.0, 0.0))])
 def test_a_phantom_on_another_grid_is_its_voxels(change):
-    """Also a phantom with exact projections, which hold for its own grid alone."""
+    """Its voxels are scanned even if it has exact projections, which hold for its own grid alone."""
     sizes = dict(DSO=1000, DSD=1500, nDetector=(40, 48), dDetector=12, nVoxel=32, angles=circular(3))
     phantom = lm.phantom('shepp_logan', size=32)
     scan_geometry = lm.Geometry.cone(**sizes, dVoxel=8.0)

@@ -34,7 +34,7 @@ def scanner(views=20, rows=80, mode='cone', flat=False):
 
 
 def scanned(geometry, data, true):
-    """Views by the real panel, with the geometry that is told."""
+    """Views through the real panel, with the nominal geometry."""
     return lm.Scan(geometry, grid.project_volume(data, true.moved(geometry)))
 
 
@@ -56,7 +56,7 @@ def test_moves_are_those_of_tigre(true):
 
 
 def test_axis_and_turn_of_the_panel():
-    """To a twentieth of a pixel and four hundredths of a degree."""
+    """They are found to a twentieth of a pixel and four hundredths of a degree."""
     geometry, data = scanner()
     pixel = geometry.dDetector[1]
     true = Panel(u=-2.4 * pixel, yaw=np.radians(0.8))
@@ -73,7 +73,8 @@ def test_axis_and_turn_of_the_panel():
 
 @pytest.mark.thorough
 def test_noisy_and_truncated():
-    """The object beyond both sides and the upper edge; a hundredth of the highest value of noise: to a tenth of a pixel."""
+    """The axis is found to a tenth of a pixel if the object is cut on both sides and above, and noise is 1 % of the highest
+    value."""
     geometry, data = scanner(30)
     pixel = geometry.dDetector[1]
     scan = scanned(geometry, data, Panel(u=1.7 * pixel))
@@ -87,8 +88,8 @@ def test_noisy_and_truncated():
 
 
 def row_scan(mode, views, total, columns, stated=0.0, true=0.0, width=1.4):
-    """One row of the foot; the panel's width is that many sides of the object at the axis. Places in columns from the foot of the
-    axis."""
+    """One row of the foot. At the axis, the panel is `width` sides of the object wide; `stated` and `true` are offsets in
+    columns."""
     phantom = lm.phantom('foot', SIZE)
     side = max(phantom.spacing) * SIZE
     data = phantom.data[:, :, SIZE // 2 : SIZE // 2 + 1]
@@ -117,7 +118,7 @@ def row_scan(mode, views, total, columns, stated=0.0, true=0.0, width=1.4):
     ],
 )
 def test_an_axis_of_objects_that_are_cut_and_one_far_off(mode, width, stated, true):
-    """To a twentieth of a pixel, and to three standard errors."""
+    """The axis is found to a twentieth of a pixel, and within three standard errors."""
     scan = row_scan(mode, 180, 360, 64, stated, true, width)
     calibration = lm.calibrate(scan, progress=False)
     right, pixel = true - stated, scan.geometry.dDetector[1]
@@ -129,7 +130,8 @@ def test_an_axis_of_objects_that_are_cut_and_one_far_off(mode, width, stated, tr
 
 @pytest.mark.thorough
 def test_an_object_that_is_cut_turns_no_panel():
-    """On both sides, of a cone beam: neither shift nor turn, whose errors are told."""
+    """If the object is cut on both sides, a cone beam gives neither a shift nor a turn, and a line warns that no edge shows
+    air."""
     geometry, data = scanner(24, rows=40)
     geometry = replace(geometry, nDetector=(32, 32))
     calibration = lm.calibrate(scanned(geometry, data, Panel()), progress=False)
@@ -139,7 +141,8 @@ def test_an_object_that_is_cut_turns_no_panel():
 
 @pytest.mark.parametrize('tilt', [pytest.param(0.0, marks=pytest.mark.thorough), 0.01])
 def test_a_drift_of_the_beam_is_no_geometry(tilt):
-    """A level that drifts by 4 % of the exposure, uniform or with slopes across the panel: read beside the object, taken out."""
+    """A level that drifts by 4 % of the exposure, uniform or with slopes across the panel, is read beside the object and taken
+    out."""
     geometry, data = scanner(24, rows=40)
     geometry = replace(geometry, dDetector=(geometry.dDetector[0] * 2, geometry.dDetector[1] * 2), nDetector=(40, 36))
     ideal = scanned(geometry, data, Panel())
@@ -155,7 +158,7 @@ def test_a_drift_of_the_beam_is_no_geometry(tilt):
 
 
 def test_drift_is_found_and_held_out_views_get_theirs():
-    """A drift of 1.2 pixels from the first to the last view: to a tenth of a pixel in every view."""
+    """A drift of 1.2 pixels from the first to the last view is found to a tenth of a pixel in every view."""
     geometry, data = scanner(40)
     pixel = geometry.dDetector[1]
     true = Drift.of(geometry, dict(u=0.8 * pixel, u1=0.6 * pixel, v1=-0.3 * pixel))
@@ -199,7 +202,8 @@ def responding(numbers, **parts):
 
 @pytest.mark.thorough
 def test_curve_of_the_detector():
-    """A fifth of the highest line integral is missing: three quarters of the error go, and a coefficient is told to 0.03."""
+    """If a fifth of the highest line integral is missing, three quarters of the error go, and a coefficient is found to
+    0.03."""
     scan, p = responding({'curve0': -0.08}, curve=1)
     calibration = lm.calibrate(scan, curve=1, progress=False)
     assert calibration.found.measured['curve0'] == pytest.approx(-0.08, abs=0.03)
@@ -208,7 +212,7 @@ def test_curve_of_the_detector():
 
 @pytest.mark.thorough
 def test_gain_over_time():
-    """A gain that falls and rises by 4 %: its polynomials to 0.01."""
+    """The polynomials of a gain that falls and rises by 4 % are found to 0.01."""
     true = dict(gain1=-0.02, gain2=0.02, gain3=0.0)
     scan, p = responding(true, gain='smooth')
     calibration = lm.calibrate(scan, gain=True, progress=False)
@@ -229,7 +233,7 @@ def test_scattered_light_is_not_negative():
 
 @pytest.mark.thorough
 def test_a_slope_of_scattered_light_alone_is_not_taken():
-    """Its mean is unknown, so it is taken for 0; half of the rest would be negative."""
+    """The mean of the light is unknown and taken for 0, so half of the slope would be negative."""
     scan, _ = responding({'scatter0_1': 0.02}, scatter='one')
     search = lm.calibrate(scan, scatter=True, progress=False).found
     assert (
@@ -240,7 +244,7 @@ def test_a_slope_of_scattered_light_alone_is_not_taken():
 
 @pytest.mark.slow
 def test_air_and_scatter():
-    """Air to 0.01, scatter to a hundredth of the open beam."""
+    """Air is found to 0.01, and scatter to a hundredth of the open beam."""
     scan, _ = responding({'air0': 0.05, 'air1': 0.03}, air='smooth')
     search = lm.calibrate(scan, air=True, progress=False).found.measured
     assert (search['air0'], search['air1']) == pytest.approx((0.05, 0.03), abs=0.01)
@@ -277,7 +281,7 @@ def test_times_of_views():
 
 @pytest.mark.parametrize('total', [720.0, 1440.0])
 def test_times_of_several_turns(total):
-    """Also if angles do not count the turns, like angles of poses."""
+    """Times count the turns even if the angles do not, like angles of poses."""
     geometry, _ = scanner(10)
     counted = replace(geometry, angles=circular(48, total))
     for scan in (counted, replace(counted, angles=np.mod(counted.angles, 2 * np.pi))):
@@ -287,7 +291,7 @@ def test_times_of_several_turns(total):
 
 
 def test_pixels_that_are_not_valid_leave_the_others():
-    """Few dead pixels spoil nearly every block of a binned scan, which is as good without them."""
+    """Dead pixels lie in nearly every block of a binned scan, and the block is as good without them."""
     geometry, data = scanner(8)
     scan = scanned(geometry, data, Panel())
     dead = np.random.default_rng(0).random(geometry.nDetector) < 0.1

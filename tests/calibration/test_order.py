@@ -59,7 +59,7 @@ def test_radians_for_degrees(foot):
 @pytest.mark.parametrize('level', [0.02, -0.02])
 @pytest.mark.parametrize('sense', [1, -1])
 def test_a_drift_of_the_beam_hides_no_sense(level, sense):
-    """2 % of the exposure over 60 views, of line integrals up to 1."""
+    """The sense is told although the beam drifts by 2 % of the exposure over 60 views, with line integrals up to 1."""
     scan = scanned('foot', views=60)
     p = scan.projections / scan.projections.max() + np.linspace(-level, level, 60)[:, None, None]
     faults = order_faults(lm.Scan(replace(scan.geometry, angles=sense * scan.geometry.angles), p))

@@ -86,7 +86,7 @@ def test_negative_light_is_doubted_beyond_three_standard_errors():
     ],
 )
 def test_numbers_are_found(parts, within):
-    """From views with noise of 0.003: air to 0.0005, gain to 0.2 %, scatter to a thousandth of the open beam."""
+    """From views with noise of 0.003, air is found to 0.0005, gain to 0.2 %, scatter to a thousandth of the open beam."""
     true, p = drawn(**parts)
     measured = true.applied(p, GEOMETRY) + np.random.default_rng(1).normal(0, 0.003, p.shape).astype(np.float32)
     response = Response.of(GEOMETRY, highest=float(p.max()), **parts)

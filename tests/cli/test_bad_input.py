@@ -121,7 +121,7 @@ def test_bad_scene(tmp_path, monkeypatch, old, new, says):
 
 
 def test_a_cloud_of_nothing(tmp_path):
-    """In Mitsuba it ends in operands of incompatible sizes."""
+    """Mitsuba itself would fail with operands of incompatible sizes."""
     from lingo_mi.files.ply import _PROPERTIES
 
     (tmp_path / 'empty.ply').write_text(
@@ -299,7 +299,7 @@ def test_more_bad_volumes(scene, tmp_path):
 
 
 class _Runs:
-    """Unpickled carelessly, it makes a file."""
+    """An object that makes a file if it is unpickled carelessly."""
 
     def __init__(self, path):
         self.path = path

@@ -40,7 +40,7 @@ def test_the_axis_is_found_and_written(fan, monkeypatch, capsys):
 
 
 def test_the_air_level_is_subtracted(fan, monkeypatch, capsys):
-    """The scan has no frames; the scanner stays as it was."""
+    """The air level is subtracted from a scan without frames, and the scanner stays as it was."""
     scan = read_scan(fan).train
     geometry = scan.geometry
     sound = np.roll(scan.projections, -2, 2)

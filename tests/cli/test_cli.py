@@ -69,7 +69,7 @@ def result(scene):
 
 
 def in_its_own_process(*arguments):
-    """A whole fit, whose sums do not depend on what this process has done before."""
+    """Run a whole fit whose sums do not depend on what this process has done before."""
     process = fit_process(*arguments)
     err = process.communicate()[1]
     assert process.returncode == 0, err
@@ -236,7 +236,7 @@ def wait_for(process, condition, seconds=300):
 @pytest.mark.posix
 @pytest.mark.thorough
 def test_resume_after_kill(scene, tmp_path):
-    """`kill -9` in the middle, then --resume: the same numbers as without the interruption. `test_crashes` has a shorter one."""
+    """After `kill -9` in the middle, --resume gives the numbers of an uninterrupted fit. `test_crashes` has a shorter test."""
     out, whole = tmp_path / 'a', tmp_path / 'whole'
     in_its_own_process(scene, '--iterations', '60', '--out', whole, *SMALL)
     arguments = scene, '--iterations', '60', '--out', out, *SMALL
@@ -256,7 +256,7 @@ def test_resume_after_kill(scene, tmp_path):
 @pytest.mark.posix
 @pytest.mark.thorough
 def test_resume_after_kills_in_a_search(scene, tmp_path):
-    """`kill -9` while the fit searches for the step to stop at, --resume, `kill -9` while it goes there, and --resume."""
+    """--resume works after `kill -9` in the search for the step to stop at, and again after one on the way to that step."""
     arguments = scene, '--iterations', '60', *SMALL, '-D', 'stop=on', '-D', 'stop_every=5', '-D', 'stop_patience=15'
     in_its_own_process(*arguments, '--out', tmp_path / 'whole')
     out, more = tmp_path / 'a', []
@@ -352,7 +352,7 @@ def test_metal_part_has_a_truth():
 
 
 def test_a_scan_in_the_place_of_a_scene(tmp_path, monkeypatch):
-    """Results are named after it; a scene does not go with it, and it needs to be there."""
+    """Results are named after the scan. It excludes --projections, and a missing scan is refused."""
     write_scan(tmp_path / 'hand.npy', tiny_scan(geometry(8)), 'npy')
     monkeypatch.chdir(tmp_path)
     code, text, err = fit('hand.npy', *QUICK)

@@ -24,7 +24,7 @@ STUDIES = sorted(
 
 @pytest.fixture
 def command(monkeypatch, capsys):
-    """Exit code (0 where it returns), standard output and standard error of `lingo-mi ARGS`, in this process."""
+    """Exit code (0 if it returns), standard output and standard error of `lingo-mi ARGS`, in this process."""
 
     def call(*args):
         monkeypatch.setattr(sys, 'argv', ['lingo-mi', *map(str, args)])

@@ -1,7 +1,6 @@
-"""Whatever call that writes is the last one, a folder holds the old result whole, or the new one whole, or a checkpoint that
-resumes to the same metrics.
+"""Wherever writing stops, a folder holds the old result or the new one whole, or a checkpoint that resumes to the same metrics.
 
-A share of the calls is tried in every run, LINGO_MI_CRASH_POINTS of them (500 unless set) with --slow.
+Every run tries a share of the calls that write; with --slow these are LINGO_MI_CRASH_POINTS calls (500 unless set).
 """
 
 import json
@@ -139,7 +138,7 @@ class Bench:
     # ---- afterwards ----
 
     def require_whole(self, seeds):
-        """metrics.json tells of the files as they are, and of one of these fits; the view files are its own."""
+        """Require that metrics.json matches the files, views included, and the metrics of one of these fits."""
         record = json.loads((self.out / METRICS).read_text())
         assert {'result.xml', 'gaussians.ply', 'volume.nii.gz', 'report.html', CHECKPOINT} <= record['files'].keys()
         for name, value in record['files'].items():
@@ -151,7 +150,7 @@ class Bench:
         return all(actual[k] == pytest.approx(wanted[k], rel=1e-4) for k in KEYS)
 
     def require_result(self, seeds, empty=False):
-        """A whole result of one of these seeds, or a checkpoint of it; or nothing, where there was nothing."""
+        """Require a whole result of one of these seeds or a checkpoint of it; with `empty`, there may be nothing."""
         mine = [self.out / name for name in MINE] if 0 in seeds else []
         assert all(path.read_text() == 'mine' for path in mine)
         if (self.out / METRICS).exists():
@@ -179,7 +178,7 @@ class Bench:
         assert np.load(self.box / 'mine.npy') == [1]
 
     def require_table(self):
-        """Every file is whole, and the same command goes on to the same table."""
+        """Require that every file is whole, and that the same command goes on to the same table."""
         for path in self.tables.rglob('[!.]*.json'):
             json.loads(path.read_text())
         self.go('tables', self.table)
@@ -194,7 +193,7 @@ class Bench:
                 )
 
     def cases(self):
-        """All that is interrupted, with the number of its calls that write."""
+        """All commands that are interrupted, with the numbers of their calls that write."""
         whole = [
             Case('fit', 'fit', self.seeds[1], self.empty, lambda: self.require_result([1], empty=True)),
             Case('force', 'fit', self.fit(1, '--force'), self.old_result, lambda: self.require_result([0, 1])),
@@ -255,7 +254,7 @@ def try_points(bench, count):
 
 
 def test_a_killed_fit_goes_on_to_the_same_numbers(tmp_path):
-    """`kill -9` half way through what it writes, then --resume."""
+    """--resume does so after `kill -9` half way through the calls that write."""
     scene, whole, out = tmp_path / 'tiny.xml', tmp_path / 'whole', tmp_path / 'result'
     scene.write_text(tiny())
     with Server() as server:

@@ -30,7 +30,7 @@ def commands_in(text):
 
 @pytest.fixture
 def understood(monkeypatch, capsys):
-    """Parses a command line, and returns the arguments; fails with what the command says of it."""
+    """Parse a command line and return its arguments; fail with what the command says of it."""
     parse = Parser.parse_known_args
 
     def stop(self, args=None, namespace=None):

@@ -229,7 +229,7 @@ def test_a_report_that_cannot_be_drawn_is_a_warning(scene, result):
 
 @pytest.mark.thorough
 def test_a_home_and_caches_that_cannot_be_written(scene, tmp_path):
-    """Even root cannot write them."""
+    """A fit does without them; even root cannot write to these."""
     nowhere = dict.fromkeys(('HOME', 'XDG_CACHE_HOME', 'XDG_CONFIG_HOME', 'MPLCONFIGDIR'), '/proc/none')
     nowhere['CUDA_ON_CPU_CACHE'] = str(tmp_path / 'kernels')  # of a stand-in for the driver, which cannot do without
     process = fit_process(scene, *QUICK, '--out', tmp_path / 'a', env=os.environ | nowhere)

@@ -121,7 +121,7 @@ def test_hardening_is_taken_out_first(tmp_path):
 
 
 def test_units_of_the_volume(scene, tmp_path):
-    """A fit, an algorithm and its slabs, in Hounsfield units."""
+    """A fit, an algorithm and its slabs write Hounsfield units."""
     hu = '--units', 'hu', '--mu-water', '0.02'
     for name, options in {'plain.nii': (), 'hu.nii': hu, 'slabs.nii': (*hu, '--slab', '9')}.items():
         code, _, err = run(RECONSTRUCT, scene, '--out', tmp_path / name, *options)

@@ -57,7 +57,7 @@ def test_two_stage(scene, dataset, fitted, tmp_path):
 
 
 def test_voxelize(scene, dataset, fitted, tmp_path):
-    """At once, and in slabs."""
+    """A fit's volume is the same at once and in slabs."""
     command = RECONSTRUCT, scene, '--algorithm', 'voxelize', '--complete', fitted, '--out'
     code, text, err = run(*command, tmp_path / 'v.nii')
     assert code == 0, err
@@ -83,7 +83,7 @@ def test_start(scene, dataset, fitted, tmp_path):
 
 
 def test_refined(scene, dataset, fitted, tmp_path):
-    """From the cloud's volume: passes over all views, then total variation and the measured ones."""
+    """`refined` starts from the cloud's volume, fits all views, and then the measured ones with total variation."""
     code, text, err = run(
         RECONSTRUCT,
         scene,
@@ -159,10 +159,8 @@ def test_refined(scene, dataset, fitted, tmp_path):
 
 
 def fitted_cloud(folder, geometry, effects, factor=1.0):
-    """The path of a scene of Gaussians of two materials, and what `completion` asks of a fit of them.
-
-    All densities are times `factor`.
-    """
+    """The path of a scene of Gaussians of two materials, and what `completion` asks of a fit of them. `factor` multiplies all
+    densities."""
     folder.mkdir()
     rng, n = np.random.default_rng(0), 30
     density, turn = rng.uniform(0.02, 0.08, n), rng.normal(size=(n, 4))
@@ -187,7 +185,7 @@ def fitted_cloud(folder, geometry, effects, factor=1.0):
 
 @physics
 def test_measured_views_become_what_is_rendered(dataset, tmp_path):
-    """Completed with line integrals, two materials seen through a blur must become such, also by a cloud that is off."""
+    """Views of two materials through a blur become line integrals before completion, even by a cloud that is off."""
     effects = Effects(tube('soft tissue + bone', '0.03, 0.06'), FocalSpot(), detector(psf=3.0))
     geometry = dataset.train.geometry
     path, true = fitted_cloud(tmp_path / 'true', geometry, effects)
@@ -229,7 +227,7 @@ def test_a_cloud_of_other_views_or_no_cloud(scene, fitted, tmp_path):
 
 
 def test_a_helix_comes_back_to_its_angles(tmp_path):
-    """At another height: the views of two turns are told by their rays, each is taken once and in its place."""
+    """Views at equal angles of two turns are told apart by their rays; each is taken once and in its place."""
     path = changed_scene(
         tmp_path,
         (
@@ -250,7 +248,7 @@ def test_a_helix_comes_back_to_its_angles(tmp_path):
 
 
 def test_views_that_repeat_each_other(dataset):
-    """Each is taken once; those that fit.py chooses, where these are of the right rays."""
+    """Each view is taken once. If the views that fit.py chooses have the right rays, they are taken."""
     geometry = dataset.train.geometry
     twice = Scan(geometry.joined(geometry), np.arange(16.0)[:, None, None] * np.ones((1, *geometry.nDetector)))
 
@@ -263,7 +261,7 @@ def test_views_that_repeat_each_other(dataset):
 
 
 def test_corrected_poses(scene, tmp_path):
-    """A fit that corrects poses knows its measured views still; they are used where it has put them."""
+    """A fit that corrects poses still knows its measured views, and they are used at the corrected poses."""
     path = tmp_path / 'fit' / 'result.xml'
     code, _, err = fit(scene, *QUICK, '--views', '4', '-D', 'rate_pose=2e-2,2e-3', '--out', path.parent)
     assert code == 0, err

@@ -81,7 +81,7 @@ def test_parquet(home):
 
 
 def test_columns_of_text_and_numbers(tmp_path):
-    """A setting of a row that failed, and the others' results: the Parquet file has one kind of value in a column."""
+    """A column of the Parquet file has one kind of value, even if a failed row has text and the others have numbers."""
     parquet = pytest.importorskip('pyarrow.parquet')
     rows = [Row('a', 2, '.'), Row('b', 3, '.'), Row('c', 4, '.', settings=dict(iterations='900'))]
     table = Table(tmp_path, rows)
@@ -286,7 +286,7 @@ def test_names_that_are_no_folder(home, name):
 
 
 def test_names_that_collide(home):
-    """They collide also if only some file systems take them for the same."""
+    """Names collide even if only some file systems take them for the same."""
     (home / 'list.csv').write_text(
         'name,geometry\nFoot,tiny.xml\nfoot,tiny.xml\nüber,tiny.xml\nu\u0308ber,tiny.xml\n,tiny.xml\n,tiny.xml\n'
     )
@@ -309,7 +309,7 @@ def test_bad_options(home, cells, message):
 
 
 def test_methods_side_by_side(home):
-    """A column need not mean something to the method of every row: it is empty there."""
+    """A column may mean nothing to the method of a row, and is empty there."""
     lines = 'fast,,5,\nnaf,,4,8\nr2,0.2,6,\nfast:start=masks,,7,\n'.splitlines()
     rows = [f'{i},tiny.xml,{line}' for i, line in enumerate(lines)]
     (home / 'list.csv').write_text('name,geometry,method,lambda_tv,iterations,field_levels\n' + '\n'.join(rows))
@@ -390,7 +390,7 @@ def test_bad_arguments(home, arguments, message):
 
 
 def test_files_that_a_geometry_names_belong_to_the_request(home):
-    """A mask and poses in files of their own; what lies beside the scan and is not read does not."""
+    """A mask and poses in their own files belong to it; files beside the scan that are not read do not."""
     geometry = lm.Geometry.cone(
         DSO=100, DSD=150, nDetector=(20, 24), dDetector=1.8, nVoxel=16, dVoxel=1.5, angles=np.linspace(0, 3, 7)
     )

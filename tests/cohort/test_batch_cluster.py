@@ -1,4 +1,4 @@
-"""A cohort on a Dask cluster: a real scheduler with three workers, of which one is killed, and refused combinations."""
+"""A cohort on a Dask cluster: a real scheduler with three workers, one of them killed, and refused combinations."""
 
 import json
 import os
@@ -59,7 +59,7 @@ def require_all_done_once(home):
 
 
 def require_same(home, name, address):
-    """An uninterrupted fit on such a worker gives the same numbers: to the bit, except on a GPU."""
+    """Require the numbers of an uninterrupted fit on such a worker: to the bit, except on a GPU."""
     record = json.loads((home / 'out' / name / METRICS).read_text())
     rows = (home / 'list.csv').read_text().splitlines()
     (home / 'one.csv').write_text('\n'.join([rows[0], rows[1 + NAMES.index(name)]]))
@@ -132,7 +132,7 @@ def test_local_workers(home, number):
 
 @pytest.mark.thorough
 def test_workers_that_cannot_do_it(home):
-    """`tests/jobs/test_worker.py` has all that is refused."""
+    """They are refused; `tests/jobs/test_worker.py` has all cases."""
     with cluster(home, workers=1, threads_of_tasks=2) as (address, _):
         code, _, err = run(BATCH, *arguments(home, address))
     assert code == 2 and 'runs 2 tasks at once' in err and err.count('\n') == 1

@@ -15,7 +15,7 @@ class Terminal(io.StringIO):
 
 
 def ticking(monkeypatch, seconds):
-    """Let the clock go on by so many seconds whenever somebody looks at it."""
+    """Let the clock advance by so many seconds each time it is read."""
     now = [0.0]
 
     def tick():
@@ -77,7 +77,7 @@ def test_resumed_loop_counts_its_own_pace(capsys, monkeypatch):
 
 
 def test_the_time_left_goes_by_the_steps_after_the_first(capsys, monkeypatch):
-    """The first may compile kernels, and may say that earlier work goes on far from its start."""
+    """The first step may compile kernels, and resumed work may begin far from the start."""
     now = [0.0]
     monkeypatch.setattr(progress.time, 'monotonic', lambda: now[0])
     with Progress('SART', 1000) as p:

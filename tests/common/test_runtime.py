@@ -60,7 +60,7 @@ def test_llvm_of_an_installer(no_llvm, monkeypatch, tmp_path, system):
 
 
 def test_an_old_llvm_that_cannot_be_exchanged(monkeypatch, tmp_path):
-    """Dr.Jit's library has no such name on Windows: what to do is said."""
+    """Dr.Jit's library has another name on Windows, so a warning says what to do."""
     monkeypatch.setenv('DRJIT_LIBLLVM_PATH', 'LLVM-C.dll')
     monkeypatch.setattr(dr.detail, 'llvm_version', lambda: (14, 0, 0))
     monkeypatch.setattr(dr, '__file__', str(tmp_path / '__init__.py'))
@@ -87,7 +87,7 @@ def test_threads_change_while_a_kernel_runs():
 
 
 def test_openmp_sleeps_unless_pytorch_is_loaded(monkeypatch):
-    """It is read once, as PyTorch is loaded: later, only a warning can help."""
+    """The variable is read once, when PyTorch is loaded. After that, only a warning can help."""
     monkeypatch.setattr(sys, 'modules', {name: module for name, module in sys.modules.items() if name != 'torch'})
     monkeypatch.delenv('OMP_WAIT_POLICY', raising=False)
     warn_of_spinning.cache_clear()

@@ -14,7 +14,7 @@ PANEL = dict(nDetector=(16, 25), dDetector=(12.0, 16.0))  # an arc of 51 degrees
 
 @pytest.mark.parametrize('offset', [(4.0, 0.0), (4.0, 4.0)])
 def test_a_curved_panel(offset):
-    """Centred, and a quarter of a pixel off: half of the views complete the scan of all."""
+    """Half of the views complete the scan of all, on a panel that is centred or a quarter of a pixel off."""
     every = geometry(angles=circular(12, start=3), offDetector=offset, **PANEL).curved()
     half = ellipsoids(every.subset(slice(None, None, 2)), BALL)
     full = insert_views(half, 12, lambda views: ellipsoids(views, BALL).projections)

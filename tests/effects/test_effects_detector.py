@@ -42,7 +42,7 @@ def test_mean_and_variance(photons, transmission, electronic):
 
 
 def test_counts_are_poisson():
-    """The histogram of counts against the distribution, by chi-square."""
+    """The histogram of counts agrees with the distribution, by chi-square."""
     counts = np.rint(detector(photons=20.0).signal(flat(0.25), 0) * 20).astype(int)
     expected = stats.poisson.pmf(np.arange(14), 5) * counts.size
     histogram = np.bincount(counts.ravel(), minlength=14)[:14]
@@ -73,7 +73,7 @@ def test_same_key_same_noise_in_any_order():
 
 
 def test_darkness_is_finite():
-    """No light, and read-out noise that makes counts negative: the floor is half a count or half a step."""
+    """Without light, and with read-out noise that makes counts negative, a floor of half a count or half a step holds."""
     for d, floor in (
         (detector(photons=100.0, electronic_noise=4.0), 0.005),
         (detector(bits=8), 0.5 * 1.25 / 255),
@@ -156,7 +156,8 @@ def test_edge_response_of_the_point_spread(sigma, softness, most):
 
 
 def test_quadrature_of_a_soft_edge():
-    """The response of a uniform spot to an edge that is an error function, integrated by hand; exponential in n."""
+    """The response of a uniform spot to an edge that is an error function converges to the integral by hand, exponentially in
+    n."""
 
     def antiderivative(x):
         return x * stats.norm.cdf(x) + stats.norm.pdf(x)

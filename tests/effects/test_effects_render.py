@@ -102,7 +102,7 @@ def test_bundles_of_rays_repeat_the_projectors(tube, film):
     ],
 )
 def test_what_is_no_matter_of_kernels(tube, film):
-    """Photons of the energy that densities are attenuation at, from a point; and what happens after the light, in NumPy."""
+    """Photons of the reference energy from a point add no kernel, and neither do effects after the light, in NumPy."""
     ideal, launched = kernels_with((None, None), (tube, film))
     assert launched == ideal
 
@@ -163,7 +163,7 @@ def test_derivative_of_hardening(materials):
 
 @physics
 def test_derivative_through_a_scene():
-    """Spectrum, focal spot, aperture and blur at once: the derivative by a density against differences of images."""
+    """With spectrum, focal spot, aperture and blur at once, the derivative by a density agrees with differences of images."""
     tube = dict(TUBE, focal_spot='.3, .2', focal_order=2)
     film = detector(psf=0.3, aperture=1.0, aperture_order=2, photons=1e5)
     weights = np.random.default_rng(2).normal(size=(23, 30, 1))
@@ -279,7 +279,7 @@ def test_edge_responses(tube, film, variance):
 
 @pytest.mark.parametrize('pixel', ['centre', 3, 'area'])
 def test_aperture_is_the_mean_over_a_pixel(pixel):
-    """Once, whatever the integrator's own rule for pixels."""
+    """The mean is taken once, whatever the integrator's own rule for pixels."""
     soft = scene_of(None, None, detector(aperture=1.0, aperture_order=8), pixel=pixel)
     fine = scene_of(pixel=16, output='transmission')
     np.testing.assert_allclose(render(soft), -np.log(render(fine)), atol=2e-4)
@@ -363,7 +363,7 @@ def test_second_material_is_a_share(share):
 
 @physics
 def test_materials_of_shapes_in_a_cloud():
-    """The one that attenuates less comes first, in whatever order shapes name them."""
+    """The material that attenuates less comes first, in whatever order shapes name materials."""
     tubes = [
         Tube.of(TubeParameters(kvp=120.0, split='.04, .09', material=one, materials=dict(a=other)))
         for one, other in (('Al', 'water'), ('water', 'Al'))

@@ -49,7 +49,7 @@ def test_small_energies_scatter_like_thomson():
 
 @pytest.mark.parametrize('material', ['water', 'Fe'])
 def test_bound_electrons(material):
-    """Coherent and incoherent together, and what angles have of them."""
+    """Coherent and incoherent scattering together have xraylib's total and its distribution of angles."""
     formula, density = dict(water=('Water, Liquid', 1.0), Fe=('Fe', xraylib.ElementDensity(26)))[material]
     table, total = scattering(60.0, material)
     assert (
@@ -188,7 +188,8 @@ def single(g, points, order=28):
 @pytest.mark.traces_rays
 @pytest.mark.parametrize('changes', [dict(), dict(offDetector=(0.0, 130.0)), dict(mode='parallel')])
 def test_single_scattering(changes):
-    """Cone, a panel that sees half of the box, and parallel rays; every point within its error, the mean within 1.5 %."""
+    """For a cone, a panel that sees half of the box, and parallel rays, every point is within its error, and the mean within
+    1.5 %."""
     g = geometry(**changes)
     view = View.of(g.rays(), 0, *g.nDetector)
     means, errors = Scatter(2**15, (4, 4), orders=1, energies=1).estimate([water_box()], tube_of(), 'count', view, 0)
@@ -256,7 +257,7 @@ def photons(g, count, rng):
 
 @pytest.mark.traces_rays
 def test_all_orders():
-    """The scattered photons of a whole panel, within 3 standard errors of both; those scattered once are far fewer."""
+    """The scattered photons of a whole panel agree within 3 standard errors of both; those scattered once are far fewer."""
     g = geometry(DSD=480.0, dDetector=(7.0, 6.0))
     view = View.of(g.rays(), 0, *g.nDetector)
     expected, error = photons(g, 400_000, np.random.default_rng(0))
@@ -276,7 +277,7 @@ def test_all_orders():
 
 @pytest.mark.traces_rays
 def test_two_names_of_one_material():
-    """A grid of two materials, told apart by density, that are one: the same light as from one."""
+    """A grid of two materials that are in truth one, told apart by density, scatters as much as one material."""
     ramp = np.broadcast_to(np.linspace(0.5, 1.5, 8)[:, None, None] * MU, (8, 8, 8)).astype(np.float32)
     box, g = GridInCube.of(ramp, LOW, HIGH, 'box'), geometry()
     view, s = View.of(g.rays(), 0, *g.nDetector), Scatter(4096, (4, 4), energies=1)
@@ -290,7 +291,7 @@ def test_two_names_of_one_material():
 
 
 def test_objects_on_a_grid():
-    """Nothing of what attenuates gets lost: integrals over the box."""
+    """No attenuation is lost: integrals over the box agree."""
     scene = load(dict(cloud=ellipsoids(cloud_of()), grid=grid(values_of()), bolt=block(1.3)))
     cloud, values, bolt = sorted(find_objects(scene), key=lambda obj: ('cloud', 'grid', 'bolt').index(obj.name))
     made = cloud_of()
@@ -308,7 +309,7 @@ def test_objects_on_a_grid():
 
 
 def test_smoothing():
-    """Noise falls, and what is smooth stays."""
+    """Noise falls, and a smooth image stays."""
     y, x = np.meshgrid(np.linspace(0, 1, 16), np.linspace(0, 1, 20), indexing='ij')
     v, u = np.meshgrid((np.arange(48) + 0.5) / 48, (np.arange(40) + 0.5) / 40, indexing='ij')
     true = 1 + np.sin(2 * u) * np.cos(1.5 * v)

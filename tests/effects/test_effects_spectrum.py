@@ -53,7 +53,7 @@ def test_tube(kvp, angle, filtration, mean, layer):
 
 
 def test_filter_is_attenuation():
-    """A filter of spekpy's is one of xraylib's: both attenuate alike to 1.5 % from 30 keV on."""
+    """A filter of spekpy's and one of xraylib's attenuate alike, to 1.5 % from 30 keV on."""
     thin, thick = tube_spectrum(120, filtration='Al 2.5'), tube_spectrum(120, filtration='Al 7.5')
     high = thin.energies > 30
     expected = thin.photons[high] * np.exp(-5 * attenuation('Al', thin.energies[high]))
@@ -158,7 +158,7 @@ def test_error_against_the_full_spectrum(materials, errors, response):
 
 @pytest.mark.parametrize('reference', [20.0, 60.0, 110.0])
 def test_bands_are_right_at_any_reference_energy(reference):
-    """Iron, until one photon in two thousand is left."""
+    """They are right for iron until one photon in two thousand is left."""
     spectrum = tube_spectrum(120.0)
     mu = attenuation('Fe', spectrum.energies)
     actual = band(spectrum.detected('energy'), [mu / attenuation('Fe', [reference])], 5, 10.0)

@@ -93,7 +93,7 @@ def test_a_chunk_is_damaged(path):
 
 
 def test_the_index_of_the_chunks_is_damaged(path):
-    """Found by mutation."""
+    """Such a file gives one line; mutation found the case."""
     content = path.read_bytes()
     assert content.count(b'TREE') > 1
     path.write_bytes(content.replace(b'TREE\x01', b'TREF\x01'))  # of chunks; a tree of groups has the type 0

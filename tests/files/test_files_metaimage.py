@@ -55,7 +55,7 @@ def test_words_for_true(tmp_path, word):
 @pytest.mark.parametrize('direction', ['TransformMatrix', 'Rotation', 'Orientation'])
 @pytest.mark.parametrize('place', ['Offset', 'Position', 'Origin'])
 def test_as_simpleitk_reads_it(tmp_path, direction, place):
-    """Fields that it does not write itself, and other names of those that it does."""
+    """Fields that SimpleITK does not write are read as it reads them, and so are other names of its fields."""
     sitk = pytest.importorskip('SimpleITK')
     path = written(
         tmp_path / 'v.mha',
@@ -74,7 +74,7 @@ def test_as_simpleitk_reads_it(tmp_path, direction, place):
 
 
 def test_what_the_header_leaves_out(tmp_path):
-    """Voxels of 1 mm along the axes, the first at the origin, as SimpleITK has it."""
+    """If the header does not say, voxels are 1 mm along the axes and the first is at the origin, as in SimpleITK."""
     np.testing.assert_array_equal(read_metaimage(written(tmp_path / 'v.mha'))[1], np.eye(4))
 
 

@@ -378,7 +378,7 @@ def test_write_refuses(tmp_path):
 
 
 def nested(levels, code):
-    """Each level holds the one below it ten times."""
+    """A pickle in which each level holds the one below it ten times."""
     return b'\x80\x04K\x01' + b''.join(
         b'\x94' + (b'(' if code == b't' else b'](') + b'h' + bytes([i]) + (b'h' + bytes([i])) * 9 + code
         for i in range(levels)
@@ -406,7 +406,7 @@ def test_bombs(tmp_path, raw, match):
 
 
 def test_every_value_counts():
-    """A list and what it holds, again where it is used again."""
+    """A list and its values count, and again at every further use."""
     held = ['a', 'b']
     for value, count in (([], 1), (held, 3), ([held, held], 7), ({'k': held}, 4)):
         assert naf._resolve(value, [count]) == value

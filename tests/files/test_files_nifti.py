@@ -63,7 +63,7 @@ def test_a_header_that_claims_more_than_there_is(tmp_path, name, shape):
 
 
 def test_extensions_and_what_follows_are_not_unpacked(tmp_path):
-    """Less than a hundred kilobytes that would unpack to tens of megabytes."""
+    """Less than a hundred kilobytes would unpack to tens of megabytes."""
     content = np.ones(SHAPE, np.float32).tobytes()
     read_nifti(claiming(tmp_path / 'v.nii.gz', SHAPE, content))
     for path in (
@@ -79,7 +79,7 @@ def test_extensions_and_what_follows_are_not_unpacked(tmp_path):
 
 @pytest.mark.parametrize('name', ['v.nii', 'v.nii.gz'])
 def test_an_extension_is_passed_over(tmp_path, name):
-    """One of thirty megabytes, which a file of kilobytes can hold."""
+    """An extension may have thirty megabytes, which a file of kilobytes can hold."""
     start = 30 << 20 if name.endswith('.gz') else 1 << 10
     size = start - 352
     extension = struct.pack('<ii', size, 4) + bytes(size - 8)

@@ -126,7 +126,7 @@ def test_units_of_length(tmp_path, space):
 
 
 def test_what_the_header_leaves_out(tmp_path):
-    """Voxels of 1 mm, the first at the origin; a kind may be none."""
+    """If the header does not say, voxels are 1 mm and the first is at the origin; a kind may be none."""
     np.testing.assert_array_equal(read_nrrd(written(tmp_path / 'v.nrrd'))[1], np.eye(4))
     changes = {'space': 'LPS', 'space directions': '(2,0,0) (0,3,0) (0,0,4)', 'kinds': 'none domain ???'}
     np.testing.assert_array_equal(read_nrrd(written(tmp_path / 'v.nrrd', changes=changes))[1], np.diag([2, 3, 4, 1]))

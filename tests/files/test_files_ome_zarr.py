@@ -55,7 +55,7 @@ def test_what_is_written_is_read_unchanged(tmp_path, volume):
 
 @pytest.mark.parametrize('version', [2, 3])
 def test_of_others(tmp_path, volume, version):
-    """Density by the rules of any file, lengths in mm, a channel of one."""
+    """Densities follow the rules of any file, lengths become mm, and an axis of one channel is dropped."""
     shift = dict(type='translation', translation=[0.0, 40.0, 30.0, 20.0])
     steps = dict(type='scale', scale=[1.0, 2000.0, 1500.0, 1000.0])
     whole = (1000 * volume.transpose(2, 1, 0)[None]).astype(np.uint16)
@@ -166,7 +166,7 @@ def test_no_folder(tmp_path):
 
 
 def test_a_chunk_that_no_memory_holds(tmp_path, volume):
-    """It is unpacked whole, however small the array."""
+    """A chunk is unpacked whole, however small the array."""
     folder = image(tmp_path / 'v.zarr', volume)
     huge = dict(name='regular', configuration=dict(chunk_shape=[1 << 20] * 3))
     damage(folder, '0/zarr.json', lambda header: header.update(chunk_grid=huge))

@@ -98,7 +98,7 @@ def test_files_of_poses(tmp_path, name):
 
 
 def test_astra_vectors_by_hand():
-    """ASTRA's cone geometry at the angle 0: source at -y, columns along x, rows along z."""
+    """ASTRA's cone geometry at the angle 0 has its source at -y, columns along x, and rows along z."""
     vector = [0, -300, 0, 0, 150, 0, 2, 0, 0, 0, 0, 1.5]
     f = astra.from_vectors([vector], SHAPE, False)
     x, y = f.project([[10.0, 0.0, 4.0], [0.0, 100.0, 0.0]], 0)
@@ -122,7 +122,7 @@ def test_matrices_by_hand():
 
 @pytest.mark.parametrize('step', [0.01, 1.0, 100.0])
 def test_a_matrix_is_parallel_to_rounding(step):
-    """Its last row is zero relative to the other rows' largest entry: one per pixel's size."""
+    """The last row counts as zero relative to the other rows' largest entry, which is one over the pixel's size."""
     g = circle(DSO=0.0, DSD=0.0, nDetector=SHAPE, dDetector=step, **GRID, angles=[0.0], mode='parallel')
     P = to_matrices(g.rays())
     P[0, 2, 0] = 0.5e-9 / step

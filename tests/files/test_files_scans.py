@@ -62,7 +62,7 @@ def test_a_scan_alone(tmp_path, kind, name):
 
 @pytest.mark.parametrize('failing', [0, 1])
 def test_an_earlier_scan_stays_whole_where_the_disk_is_full(tmp_path, monkeypatch, failing):
-    """Neither the mask nor the geometry of the new one goes with the old projections."""
+    """Neither the mask nor the geometry of the new scan is left with the old projections."""
     old, calls = small_dataset().train, []
     old = replace(old, valid=np.arange(old.projections.size).reshape(old.projections.shape) > 0)
     write_scan(tmp_path / 'a.npy', old, 'npy')

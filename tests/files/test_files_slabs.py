@@ -42,7 +42,7 @@ def slabs(volume, thickness):
 
 @pytest.mark.parametrize('name', ['v.nii', 'v.nii.gz'])
 def test_nifti(tmp_path, name):
-    """Byte for byte what the whole volume gives, but for what gzip keeps of the name and the time."""
+    """The file is the whole volume's, byte for byte, except for the name and the time that gzip keeps."""
     g, v = geometry((7, 6, 11)), noise((7, 6, 11))
     write_slabs(tmp_path / name, g.grid, slabs(v, 4))
     write_volume(tmp_path / 'whole.nii', v, g.grid, 'density per mm')
@@ -222,7 +222,7 @@ print(before, peak())
 @pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='asks Linux for its peak memory')
 @pytest.mark.thorough
 def test_memory_is_that_of_a_slab(tmp_path):
-    """A volume of sixteen times the slices, 134 MB, takes no more."""
+    """A volume with sixteen times the slices, 134 MB, takes no more memory."""
     command = [sys.executable, '-c', PROGRAM, str(tmp_path), '512']
     before, peak = map(int, subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
     assert (tmp_path / 'b.nii').stat().st_size > 4 * 256 * 256 * 512 and peak - before < 15e6, (before, peak)

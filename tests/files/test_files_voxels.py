@@ -84,7 +84,7 @@ def test_values_beyond_float32(tmp_path):
 
 
 def test_a_little_below_zero_is_noise(tmp_path):
-    """Up to a tenth of the highest value, also where that is not 1."""
+    """Values down to minus a tenth of the highest value are noise, also if that value is not 1."""
     values = np.where(COUNTS == 3, -0.15, COUNTS * (2.0 / 119) + 1e-3)
     assert read_array(tmp_path, values).data.min() <= 0
     np.save(tmp_path / 'v.npy', np.where(COUNTS == 3, -0.25, values))
@@ -93,7 +93,7 @@ def test_a_little_below_zero_is_noise(tmp_path):
 
 @pytest.mark.parametrize('ratio, bytes_a_voxel', [(1, 8), (1000, 12)])
 def test_memory_that_an_array_of_a_file_needs(tmp_path, monkeypatch, ratio, bytes_a_voxel):
-    """float32 twice, and its own bytes where they are unpacked first."""
+    """It needs float32 twice, and its own bytes if they are unpacked first."""
     asked = []
     monkeypatch.setattr(voxels, 'require_room', lambda size, *_: asked.append(size))
     (tmp_path / 'v').write_bytes(bytes(480))

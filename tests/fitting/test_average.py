@@ -55,7 +55,7 @@ def test_measurements_are_of_the_mean():
 
 @pytest.mark.parametrize('stop', [14, 12, 16])
 def test_a_resumed_fit_has_the_same_mean(tmp_path, stop, sums_in_order):
-    """Stopped in between, right after a densification, or after the last step."""
+    """It is stopped in between, right after a densification, or after the last step."""
     scan, path = tiny_scan(geometry()), tmp_path / 'fit.npz'
     whole = loop.run(scan, AVERAGED, seed=3)
     with pytest.raises(KeyboardInterrupt):

@@ -87,7 +87,7 @@ def whole(tmp_path_factory):
 
 @pytest.fixture
 def refused(tmp_path):
-    """A function of altered entries: writes them and returns the line by which they are refused."""
+    """A function that writes altered entries and returns the line by which they are refused."""
 
     def refused(content=None, raw=None):
         path = tmp_path / 'altered.npz'
@@ -109,7 +109,7 @@ def line(path):
 
 
 def altered(content, name, way):
-    """The entries with one of them altered; None where this cannot be."""
+    """The entries with one of them altered; None if that is impossible."""
     rest = {k: v for k, v in content.items() if k != name}
     if way == 'missing':
         return rest
@@ -130,7 +130,7 @@ def test_the_test_knows_every_entry(whole):
 
 @pytest.mark.parametrize('name', short({name: name for name in ARRAYS}, IN_SHORT_FORM))
 def test_altered_arrays(whole, refused, tmp_path, name):
-    """With the checksum that was; and with a right one, where the alteration shows."""
+    """They are refused with the old checksum, and with a right one if the alteration shows."""
     path, content = whole
     for way in WAYS:
         bad = altered(content, name, way)
@@ -309,7 +309,7 @@ def test_sizes_are_checked_before_memory_is_taken(whole, refused, tmp_path):
 
 
 def test_bytes_that_were_altered(whole, refused):
-    """Whatever byte of a checkpoint's content is flipped, wherever it is cut."""
+    """A checkpoint is refused whatever byte of its content is flipped, and wherever it is cut."""
     raw = whole[0].read_bytes()
     rng = np.random.default_rng(0)
     for at in rng.integers(0, len(raw), 40):
@@ -338,7 +338,7 @@ def test_files_that_are_no_files(tmp_path):
 
 @pytest.mark.parametrize('version', [None, 1, 3, 2.5, '2', True])
 def test_other_versions_are_refused(whole, tmp_path, version):
-    """Checkpoints of earlier programs, the first without version and checksum, and of later programs."""
+    """They belong to earlier programs, at first without version and checksum, and to later programs."""
     _, content = whole
     extra, path = json.loads(str(content['extra'])), tmp_path / 'checkpoint.npz'
     before = {k: v for k, v in extra.items() if k != 'version'}

@@ -40,7 +40,7 @@ def data():
     ids=lambda m: m.name,
 )
 def test_fit(method, data, tmp_path, no_report):
-    """Held-out views are predicted; what is written is read again, with the curved panel."""
+    """Held-out views are predicted, and a saved result is read with its curved panel."""
     fit = lm.fit(data, method, iterations=120, progress=False)
     psnr = fit.metrics()['psnr_2d']
     assert psnr > 30
@@ -58,7 +58,7 @@ def test_fit(method, data, tmp_path, no_report):
 
 
 def test_the_scene_of_a_result_renders_it(data, tmp_path, no_report):
-    """Also if poses were corrected, so that no two panels are alike."""
+    """This holds also if poses were corrected, so that no two panels are alike."""
     for name, rates in (('plain', '0,0'), ('poses', '2e-4,2e-5')):
         fit = lm.fit(data, lm.Fast(iterations=40).changed(rate_pose=rates), progress=False)
         assert isinstance(fit.geometry, CurvedGeometry)

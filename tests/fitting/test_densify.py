@@ -211,7 +211,7 @@ def test_densify_clones_the_small_and_splits_the_large():
 
 
 def test_the_mean_gradient_decides():
-    """At the threshold a Gaussian is chosen, just below it is not, however often it was seen."""
+    """A Gaussian is chosen at the threshold and not just below it, however often it was seen."""
     state = state_of(np.random.default_rng(6), 4, size=0.05)
     state.gradient[:], state.visits[:] = [1, 0.999, 10, 9.99], [1, 1, 10, 10]
     assert len(densify(state, CONTROL, FORWARD, HALF, np.random.default_rng(0))) == 6

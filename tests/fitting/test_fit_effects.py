@@ -95,7 +95,7 @@ def test_absent_costs_nothing(monkeypatch, effects, changes):
 
 @physics
 def test_a_second_view_compiles_nothing():
-    """With all effects at once, too."""
+    """This holds with all effects at once, too."""
     effects = Effects(
         tube('soft tissue + bone', '0.01, 0.03'), SPOT, detector(psf=15.0, aperture=1.0, aperture_order=2)
     )
@@ -107,7 +107,7 @@ def test_a_second_view_compiles_nothing():
 
 
 def test_kernels_do_not_grow_with_the_bundles():
-    """Each is of one bundle: one of all would not find registers enough on a GPU."""
+    """Each kernel is of one bundle: one of all bundles would not find registers enough on a GPU."""
 
     def of(order):
         stepper, state = stepper_of(Effects(None, SPOT, detector(aperture=1.0, aperture_order=order)))
@@ -146,7 +146,7 @@ def test_the_fit_sees_what_the_integrator_renders(name, tmp_path):
 @physics
 @pytest.mark.parametrize('name', EFFECTS)
 def test_derivatives_by_differences(name):
-    """Derivatives of the loss by densities, scales and centres, through the model."""
+    """Derivatives of the loss by densities, scales and centres agree with differences, through the model."""
     stepper, state = stepper_of(EFFECTS[name](), lambda_tv=0.0)
     target = stepper.targets[1]
     stepper.share = stepper.model.shares(state)
@@ -236,7 +236,7 @@ def test_dead_pixels_are_left_out():
 
 
 def test_noise_is_weighed():
-    """Weighted, all pixels have the same noise, dark ones too; what is not valid spoils no neighbour."""
+    """Weights give all pixels the same noise, dark ones too, and invalid pixels spoil no neighbour."""
     seen = detector(photons=2000.0, electronic_noise=5.0)
     p = np.broadcast_to(np.repeat([0.0, 1.0, 2.0, 3.0], 8), (2, 32, 32))
     g, effects = geometry(2), Effects(None, None, seen)
@@ -293,7 +293,7 @@ def test_saturated_pixels_pull_only_from_above():
 
 @physics
 def test_resumed_fit_is_the_same_fit(tmp_path, variant):
-    """Also between two looks at the shares of two materials."""
+    """A fit may stop between two updates of the shares of two materials, too."""
     scan = tiny_scan(geometry(3))
     scan = replace(scan, projections=scan.projections / 50, effects=EFFECTS['two materials']())
     whole, path = run(scan, SHORT, seed=3), tmp_path / 'fit.npz'
@@ -306,7 +306,7 @@ def test_resumed_fit_is_the_same_fit(tmp_path, variant):
 
 @physics
 def test_what_a_fit_leaves_behind(tmp_path):
-    """result.xml gives the held-out views."""
+    """result.xml renders the held-out views."""
     (tmp_path / 'scene.xml').write_text(XML)
     quick = '--iterations', '40', '-D', 'n_points=300', '-D', 'densify_from=100'
     for effects in ('model', 'ignore'):
@@ -362,7 +362,7 @@ def test_a_checkpoint_needs_the_effects_that_were_modelled(tmp_path, monkeypatch
 
 @physics
 def test_a_cloud_stands_for_all_shapes():
-    """A fit of shapes of several materials has one cloud: what starts from it asks for no shape's material."""
+    """A fit of shapes of several materials has one cloud, and a start from it asks for no shape's material."""
     made = Tube.of(TubeParameters(kvp=120.0, material='water', materials=dict(bolt='Al'), split='.04, .09'))
     scan = replace(tiny_scan(geometry(8)), effects=Effects(made))
     scan = replace(scan, projections=scan.projections / 20)

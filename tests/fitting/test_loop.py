@@ -95,7 +95,7 @@ SOON = 'rate_pose', 'rate_centre', 'tv_stride', 'epsilon'
 
 @pytest.mark.parametrize('name', [pytest.param(k, marks=[] if k in SOON else pytest.mark.slow) for k in ENDS])
 def test_the_ends_of_every_range(scan, name, tmp_path):
-    """A fit with method as far as they may go is a fit, or one line."""
+    """With an option as far as it may go, a fit gives a result, or one line."""
     usual = SHORT.changed(
         iterations=3,
         start='fdk' if name.startswith('fdk') else 'masks',
@@ -147,7 +147,7 @@ def test_each_method(name, scan):
 @pytest.mark.parametrize('densify', [dict(densify='clone', split_size=0.08), dict(densify='halve')])
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_fan_beam_stays_in_its_plane(mode, densify):
-    """One row and one slice: nothing may leave the plane or turn out of it."""
+    """With one row and one slice, nothing may leave the plane or turn out of it."""
     g = geometry(6, nDetector=(1, 48), dDetector=(8.0, 8.0), nVoxel=(32, 32, 1), mode=mode)
     scan, method = tiny_scan(g, flat=True), SHORT.changed(**densify)
     fitted = run(scan, method)
@@ -161,7 +161,7 @@ def test_fan_beam_stays_in_its_plane(mode, densify):
 
 @pytest.mark.parametrize('stride', [1, 2, 3])
 def test_total_variation_is_of_every_nth_voxel(scan, stride):
-    """With so many samples that they fit in one place only, between the first and the last voxels."""
+    """The samples are so many that they fit in one place only, between the first and the last voxels."""
     g = scan.geometry.on(Grid((13, 13, 7), (20.0, 20.0, 36.0), scan.geometry.grid.centre))
     method = SHORT.changed(tv_stride=stride, tv_size=13, extent=6.0)
     model, forward, start = method.model(g, 0.5), method.forward, some_points(g)
@@ -176,7 +176,8 @@ def test_total_variation_is_of_every_nth_voxel(scan, stride):
 
 @pytest.mark.parametrize('batch', [1, 2])
 def test_the_dynamic_factor_is_on_the_whole_loss(scan, batch, monkeypatch):
-    """On L1, SSIM and total variation alike (paper, section III-C): the step's gradient is the plain one times the factor.
+    """It multiplies L1, SSIM and total variation alike (paper, section III-C), so the step's gradient is the plain one times
+    the factor.
 
     With a batch of views, the total variation has the mean of their factors.
     """
@@ -241,7 +242,7 @@ def test_no_kernel_is_compiled_after_the_first_steps():
     ],
 )
 def test_replayed_steps_are_the_traced_ones(scan, changes, masked, sums_in_order):
-    """To the last bit, through densifications."""
+    """They agree to the last bit, through densifications."""
     method = SHORT.changed(iterations=20, densify_from=0, densify_every=5, **changes)
     if masked:
         scan = replace(scan, valid=np.random.default_rng(0).random(scan.projections.shape) > 0.1)
@@ -301,7 +302,7 @@ def test_values_of_invalid_pixels_do_not_count(scan):
 
 
 def test_total_variation_beside_more_views(scan):
-    """No more of it in n steps, one a view, from `tv_views` on; once only, when limits meet limits."""
+    """Beyond `tv_views` views, n steps of one view each have no more of it; limits that are applied again change nothing."""
     method = SHORT.changed(lambda_tv=0.3, tv_views=2)
     actual = method.bounded(scan)
     assert len(scan) == 3 and actual.loss.lambda_tv == pytest.approx(0.2)
@@ -318,7 +319,7 @@ def test_rates_in_lists(scan):
 
 
 def test_fits_in_several_threads():
-    """They take turns: in Dr.Jit at once, they would wait for each other for ever."""
+    """They take turns, because at once in Dr.Jit they would wait for each other for ever."""
     code = """
 import concurrent.futures, numpy as np, lingo_mi as lm
 g = lm.Geometry.cone(DSO=100, DSD=150, nDetector=12, dDetector=3, nVoxel=10, dVoxel=2, angles=lm.circular(4))

@@ -17,7 +17,7 @@ from lingo_mi.fitting.loop import run
 
 @pytest.mark.parametrize('stop', [13, 12])
 def test_resumed_fit_is_the_same_fit(scan, whole, tmp_path, stop, sums_in_order):
-    """Stopped between densifications or right after one."""
+    """It is stopped between densifications, or right after one."""
     path = tmp_path / 'fit.npz'
     with pytest.raises(KeyboardInterrupt):
         run(scan, SHORT, seed=3, path=path, progress=stop_at(stop))
@@ -100,7 +100,7 @@ def test_absent_checkpoint_is_refused(scan, tmp_path):
 
 
 def test_what_updates_something_in_shares_of_its_steps_is_not_made_longer(tmp_path):
-    """A gain of the views: half of a longer fit is another fit."""
+    """For a fit with a gain of the views, half of a longer fit is another fit."""
     scan, path = tiny_scan(geometry()), tmp_path / 'checkpoint.npz'
     method = SHORT.changed(iterations=2, decay_steps=100, fit_gain='view')
     run(scan, method, path=path)

@@ -60,7 +60,7 @@ def test_its_steps_are_those_of_a_fit_without_a_search(scan, whole, tmp_path, su
 
 
 def fitting(iteration):
-    """Interrupts the fit itself, after the search."""
+    """A function of progress that interrupts the fit itself, after the search."""
 
     def progress(done, **fields):
         if 'stops_at' in fields and done == iteration:
@@ -70,7 +70,7 @@ def fitting(iteration):
 
 
 def searched_enough(done, **fields):
-    """Interrupts right after the last look: the next step would be the first of the fit."""
+    """Interrupt right after the last look, when the next step would be the first of the fit."""
     if searched_enough.errors != fields.get('held_out'):
         searched_enough.errors, searched_enough.looks = fields.get('held_out'), searched_enough.looks + 1
     if searched_enough.looks == searched_enough.wanted:
@@ -156,7 +156,7 @@ def test_bad_options(views, changes, message):
 
 
 def test_views_that_are_held_out_are_not_seen(scan, tmp_path, sums_in_order):
-    """Neither by the start nor by the steps: whatever they show, the search is at the same state."""
+    """Neither the start nor the steps see them: whatever they show, the search reaches the same state."""
     held_out = HeldOut(scan, METHOD)
     assert len(held_out.seen) == 10 and len(held_out.views) == 2
     seen = {view.tobytes() for view in held_out.seen.projections}
@@ -220,7 +220,7 @@ def test_altered_checkpoints(scan, tmp_path, where):
 
 
 def test_views_without_a_valid_pixel_do_not_count(scan, tmp_path):
-    """They are not views to hold out, and a search that sees fewer goes on from its checkpoint."""
+    """They are not held out, and a search that sees fewer views goes on from its checkpoint."""
     valid = np.ones(scan.projections.shape, bool)
     valid[3] = False
     path, method = tmp_path / 'fit.npz', METHOD.changed(start='points', fit_air='view')

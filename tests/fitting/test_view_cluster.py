@@ -59,10 +59,10 @@ def two_workers(monkeypatch):
 
 
 def require_close(actual, wanted):
-    """By Adam's first moments, which are sums of the steps' gradients.
+    """Compare fits by Adam's first moments, which are sums of the steps' gradients.
 
-    Adam divides by the root of a mean square. So it moves by a whole step what has a gradient of rounding alone, such as the
-    rotation of a sphere.
+    Adam divides by the root of a mean square. A gradient of rounding alone, such as by the rotation of a sphere, therefore
+    causes a whole step.
     """
     for name, values in wanted.state.first.items():
         np.testing.assert_allclose(actual.state.first[name], values, atol=1e-5 * np.abs(values).max(), err_msg=name)
@@ -75,7 +75,7 @@ def require_close(actual, wanted):
 
 
 def test_the_fit_of_one_process(scan, two_workers):
-    """Two views on one worker and one on the other, also after a densification."""
+    """Two views are on one worker and one on the other, also after a densification."""
     method = SHORT.changed(
         batch=3, iterations=4, loss_scale='dynamic', densify_from=0, densify_every=2, densify_threshold=5e-3
     )
@@ -96,7 +96,7 @@ def test_opacities(scan, two_workers):
     'effects', [lambda: Effects(None, SPOT, detector(psf=8.0)), pytest.param(lambda: Effects(tube()), marks=physics)]
 )
 def test_modelled_effects(scan, two_workers, effects):
-    """They travel with the scan."""
+    """The effects travel with the scan."""
     seen = Scan(scan.geometry, scan.projections / 50, effects=effects())
     require_close(run(seen, TWO, cluster=two_workers), run(seen, TWO))
 
@@ -119,7 +119,7 @@ def test_what_workers_cannot_do(scan, two_workers):
 
 @pytest.mark.thorough
 def test_a_worker_is_killed(scan, tmp_path):
-    """On real workers, one of which dies in the middle; and a start that they do not have."""
+    """One of two real workers dies in the middle of a fit. A start that the workers do not have is refused."""
     method = TWO.changed(start='masks', n_points=60, iterations=6)
     with dask_cluster(tmp_path, workers=2) as (address, processes):
         numbers = list(processes().values())

@@ -184,7 +184,7 @@ def test_dr_jit_vectors(views):
 
 
 def test_literals():
-    """Arrays of one number repeated, which Dr.Jit does not store."""
+    """Arrays may repeat one number, which Dr.Jit does not store."""
     equal = [mi.TensorXf(x) for x in (np.zeros((5, 3)), np.full((5, 3), 9), np.tile([0, 0, 0, 1], (5, 1)))]
     image = project(*equal, dr.full(mi.TensorXf, 0.2, 5), scan())
     one = project(np.zeros((1, 3)), np.full((1, 3), 9), [[0, 0, 0, 1]], [1.0], scan())
@@ -192,7 +192,7 @@ def test_literals():
 
 
 def test_a_virtual_panel_at_the_axis():
-    """The same rays, whose pixels have two thirds of the size there, meet the same Gaussians, those behind the axis, too."""
+    """The same rays, through pixels two thirds as large, meet the same Gaussians, also those behind the axis."""
     far = scan()
     virtual = replace(far, DSD=500, dDetector=(7 / 1.5, 4.0))
     values = columns(gaussians())
@@ -200,7 +200,7 @@ def test_a_virtual_panel_at_the_axis():
 
 
 def test_anything_that_numpy_reads():
-    """Lists, whole numbers, float64, arrays of another order of memory, and what knows __dlpack__ alone."""
+    """These are lists, whole numbers, float64, arrays of another order of memory, and objects with __dlpack__ alone."""
 
     class Foreign:
         def __init__(self, values):
@@ -256,7 +256,7 @@ def test_torch_parameters_and_no_grad():
 
 
 def test_a_constant_in_torch():
-    """Derivatives by some of the four alone."""
+    """Derivatives may be by some of the four arrays alone."""
     framework('torch')
     arrays = arrays_of('torch', columns(gaussians()))
     arrays[3].requires_grad_()
@@ -279,7 +279,8 @@ def test_within_a_jitted_function_of_jax():
 
 @pytest.mark.thorough
 def test_a_training_loop_in_torch():
-    """Twelve Gaussians fitted to 8 views of as many, two views a step: the volume ends within a tenth of the true one."""
+    """Twelve Gaussians are fitted to 8 views of as many, two views a step, and the volume ends within a tenth of the true
+    one."""
     torch = framework('torch')
     g = CircularGeometry(DSO=500, DSD=750, nDetector=(32, 32), dDetector=6, angles=circular(8), grid=Grid((16,) * 3, 8))
     rng, truth = np.random.default_rng(5), columns(random_cloud(np.random.default_rng(4), 12, spread=30, size=10))
@@ -430,7 +431,7 @@ def test_torch_devices():
 
 @pytest.mark.parametrize('kind', KINDS[:1] + KINDS[2:])
 def test_a_fresh_process(kind):
-    """The variant is chosen on first use; what the caller has not imported is not."""
+    """The variant is chosen on first use, and a framework that the caller has not imported is not imported."""
     framework(kind)
     make = dict(numpy='numpy.asarray', torch='torch.tensor', jax='jax.numpy.asarray')[kind]
     program = f"""

@@ -93,7 +93,7 @@ def test_transpose(geometry, model, masked):
 
 
 def test_the_models():
-    """Joseph's has an error; where it does not serve, the exact one takes its place, and says so."""
+    """Joseph's model has an error. If it does not serve a scan, the projector takes the exact one, and says so."""
     assert Projector(GEOMETRIES['cone']).model == 'joseph' == Projector(GEOMETRIES['tilted']).model
     assert Projector(GEOMETRIES['source in the volume']).model == 'exact'
     smooth = np.add.outer(np.add.outer(np.sin(np.arange(9) / 3), np.cos(np.arange(11) / 3)), np.ones(7))
@@ -142,7 +142,7 @@ def test_derivatives_of_drjit():
 
 
 def test_derivatives_of_torch():
-    """Reverse twice, forward, vectorised, and all together; in float64 against differences."""
+    """Derivatives are taken in reverse twice, forward, vectorised, and all together; in float64 they agree with differences."""
     torch = framework('torch')
     A = Projector(GEOMETRIES['cone'])
     x, y = (array_of('torch', v) for v in pair(A.domain_shape, A.range_shape))
@@ -204,7 +204,7 @@ def test_within_torch_compile():
 
 
 def test_an_unrolled_network_learns():
-    """Steps of gradient descent whose sizes are learnt, and a small convolution between them."""
+    """It has steps of gradient descent whose sizes are learnt, and a small convolution between them."""
     torch = framework('torch')
     torch.manual_seed(0)
     A = Projector(GEOMETRIES['cone'])

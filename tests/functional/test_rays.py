@@ -78,7 +78,7 @@ def cloud_of(count=9):
 
 @each_scan
 def test_images_of_clouds(scan):
-    """Against differences of the float64 oracle; the values equal the values for the geometry's own rays."""
+    """Derivatives agree with differences of the float64 oracle, and values equal those for the geometry's own rays."""
     cloud, arrays = cloud_of()
     weights = np.random.default_rng(0).normal(size=(2, *scan.nDetector))
     vectors, tensors = scan.rays().vectors, [mi.TensorXf(x) for x in arrays]
@@ -108,7 +108,7 @@ def test_images_of_clouds(scan):
 
 @each_scan
 def test_joseph(scan):
-    """Against differences of the model's float64 matrix, whose steps are too small to meet a kink."""
+    """Derivatives agree with differences of the model's float64 matrix, whose steps are too small to meet a kink."""
     x, vectors = volume(), scan.rays().vectors
     axes = 2 if isinstance(scan, CircularGeometry) or scan is SCANS['off centre'] else 3  # that may be the main one
     A, tensor = Projector(scan), mi.TensorXf(x)
@@ -131,7 +131,7 @@ def test_joseph(scan):
 
 @each_scan
 def test_the_exact_model(scan):
-    """Against differences of itself, also with density at the faces, and from a source within the volume."""
+    """Derivatives agree with differences of the model, also with density at the faces and from a source within the volume."""
     for some in (scan, *([replace(scan, DSO=8.0, DSD=60.0)] if scan is SCANS['cone'] else [])):
         aligned = scan is SCANS['parallel']  # rays along a face: the image jumps where they leave the box
         x, vectors = volume(int(aligned)), some.rays().vectors
@@ -148,7 +148,7 @@ def test_the_exact_model(scan):
 
 
 def test_volume_and_rays_together():
-    """The derivative by the volume is the transpose at the rays; invalid pixels have none."""
+    """The derivative by the volume is the transpose at the rays; invalid pixels do not count."""
     scan, x = SCANS['tilted'], volume()
     valid = np.random.default_rng(3).random((2, *scan.nDetector)) < 0.6
     A = Projector(scan, valid=valid)
@@ -169,13 +169,13 @@ def test_volume_and_rays_together():
 
 
 def moved(rays, motion):
-    """Turned by motion[:3], radians, and shifted by motion[3:], mm: once, or [n, 6] for each view."""
+    """The rays turned by motion[:3], radians, and shifted by motion[3:], mm: once, or [n, 6] for each view."""
     motion = np.asarray(motion).reshape(-1, 6)
     return rays.moved(Rotation.from_rotvec(motion[:, :3]).as_matrix(), motion[:, 3:])
 
 
 def registered(images, measured, rays, common):
-    """The motion of all views together, or of each, that a gradient method finds from none."""
+    """The motion of all views together, or of each, that a gradient method finds when it starts from none."""
     target = mi.TensorXf(measured)
     estimate = rays
     for _ in range(2):  # derivatives are by a small motion: start again from what was found
@@ -210,7 +210,7 @@ def true_object():
 @pytest.mark.parametrize('common', [True, False], ids=['all views', 'each view'])
 @pytest.mark.parametrize('of', ['cloud', 'voxels'])
 def test_a_shift_and_a_turn_are_recovered(of, common):
-    """Half a millimetre and one degree, of all views together or of each, to a fiftieth of that."""
+    """Half a millimetre and one degree, of all views together or of each, are found to a fiftieth."""
     (grid, cloud, values), views = true_object(), 2
     scan = Geometry.cone(
         DSO=300, DSD=450, nDetector=(16, 16), dDetector=3.75, angles=np.linspace(0.2, 2.2, views), grid=grid

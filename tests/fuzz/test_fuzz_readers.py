@@ -21,7 +21,7 @@ CHEAP = tuple(name for name in NAMES if name != 'scene')
 
 @pytest.mark.parametrize('name', CHEAP)
 def test_the_good_files_are_read(tmp_path, name):
-    """Otherwise nothing but the first check would see the mutated ones."""
+    """Otherwise the readers' first check would refuse all mutated ones."""
     if name in ('ome-zarr', 'zarr, yml'):
         pytest.importorskip('zarr')
     read, samples = reader(name)
@@ -42,7 +42,7 @@ def test_mutated_files_in_this_process(tmp_path, name, rng):
     'cases', [10, pytest.param(40, marks=pytest.mark.thorough), pytest.param(5000, marks=pytest.mark.slow)]
 )
 def test_mutated_files_in_children(cases):
-    """Under a limit of time and memory; also scenes, whose reader is not Python alone."""
+    """Children read them within limits of time and memory, also scenes, whose reader is not Python alone."""
     tallies = run(NAMES, cases, seed=1)
     failures = {name: tally.failures for name, tally in tallies.items() if tally.failures}
     assert not failures
@@ -51,7 +51,7 @@ def test_mutated_files_in_children(cases):
 
 
 def test_an_entry_of_a_checkpoint_whose_header_has_no_end(tmp_path):
-    """Found by mutation: NumPy asks Python's tokenizer, which has an exception of its own."""
+    """NumPy asks Python's tokenizer, which has an exception of its own. Mutation found the case."""
     content = corpus.others()['checkpoint'][0].files['c.npz'].content()
     (tmp_path / 'c.npz').write_bytes(content)
     with zipfile.ZipFile(tmp_path / 'c.npz') as archive:

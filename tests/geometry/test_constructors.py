@@ -59,7 +59,7 @@ def test_circles(make):
 
 @pytest.mark.parametrize('angles', [np.arange(25) * 14.4, np.arange(36) * 10, np.arange(720) / 2])
 def test_angles_in_degrees(angles):
-    """Whole numbers or not; a helix may make many turns, and four turns are not taken for degrees."""
+    """Degrees are noticed, whole numbers or not; the many turns of a helix are not taken for degrees."""
     numbers = CONE | dict(angles=angles)
     with pytest.warns(UserWarning, match=r'turns.* give numpy.radians\(angles\)'):
         Geometry.cone(**numbers)
@@ -84,7 +84,7 @@ def test_one_number_stands_for_all():
 
 @pytest.mark.parametrize('name', MOTION)
 def test_motion(name):
-    """Each alone, the others left out; only an offset keeps the circle."""
+    """Each motion is tested alone, without the others; only an offset keeps the circle."""
     g = Geometry.cone(**CONE, **{name: MOTION[name]})
     assert isinstance(g, CircularGeometry) == (name == 'offDetector')
     same_rays(g.rays(), scanner(**{name: MOTION[name]}))
@@ -273,7 +273,7 @@ def test_tigre_motion():
 
 
 def test_tigre_moves_the_object():
-    """An offOrigin a view: the object at its place there is seen as TIGRE sees it."""
+    """With an offOrigin for each view, the object at its place there is seen as TIGRE sees it."""
     moves = np.array([[3.0, -2.0, 1.0], [0.0, 4.0, 2.0], [-1.0, 0.0, 5.0]])  # (z, y, x)
     g = Geometry.from_tigre(tigre(offOrigin=moves), ANGLES)
     np.testing.assert_allclose(g.grid.centre, moves.mean(0)[::-1])
@@ -392,7 +392,8 @@ PLANE = dict(
 
 @pytest.mark.parametrize('kind', ['fanflat', 'parallel'])
 def test_astra_in_two_dimensions(kind):
-    """Its rays by `astra.functions.geom_2vec` of both types, and by its vectors, in the plane z = 0 of the one slice."""
+    """The rays are those of `astra.functions.geom_2vec` for both types, and of its vectors, in the plane z = 0 of the one
+    slice."""
     proj = dict(type=kind, DetectorWidth=2.0, DetectorCount=24, ProjectionAngles=ANGLES)
     if kind == 'fanflat':
         proj |= dict(DistanceOriginSource=900, DistanceOriginDetector=500)

@@ -50,7 +50,7 @@ def curved(request):
 
 @pytest.mark.parametrize('shift', [0.0, 1.5, -37.0])
 def test_pixels_lie_on_the_arc_about_the_focal_spot(shift):
-    """By hand: the angle of a column is its arc over DSD, from the central ray."""
+    """By hand, the angle of a column from the central ray is its arc over DSD."""
     g = flat(offDetector=(4.0, shift)).curved()
     x, y = np.meshgrid(np.arange(30) + 0.5, np.arange(12) + 0.5)
     for view, a in enumerate(ANGLES):
@@ -119,7 +119,7 @@ def test_the_same_curve_in_every_frame(curved):
 
 @pytest.mark.parametrize('columns', [30, 31, 32])
 def test_binned(columns):
-    """Three columns and rows as one, on the same arc; columns at the end are dropped."""
+    """Three columns and rows become one, on the same arc; columns left over at the end are dropped."""
     g = flat(nDetector=(12, columns), offDetector=(3.0, 1.5)).curved()
     three = g.binned(3)
     assert three.nDetector == (4, 10) and isinstance(three, CurvedGeometry) and three.radius == g.radius

@@ -91,7 +91,7 @@ def test_other_poses_are_kept(change):
     ],
 )
 def test_no_motion_is_the_circle(change):
-    """A helix of pitch 0, a tilt of 0, ... among them."""
+    """A helix of pitch 0 and a tilt of 0 are among such motions."""
     g = moving(**change)
     assert isinstance(g, CircularGeometry)
     np.testing.assert_allclose(pixels(g.rays()), pixels(circle().rays()), atol=1e-10)
@@ -215,7 +215,7 @@ def plane(one, other, origin):
 
 @pytest.mark.parametrize('change, is_line', [({}, True), (dict(angles=[np.radians(-50)]), False)])
 def test_oblique_plane_through_the_axis(change, is_line):
-    """Seen from its own direction it is one column; from the opposite angle it is not."""
+    """The plane is one column if it is seen from its own direction, and is not from the opposite angle."""
     x, _ = (
         moving(**{**dict(angles=[np.radians(50)], mode='parallel'), **change})
         .rays()
@@ -346,7 +346,7 @@ def test_angles_that_look_like_degrees_cause_a_warning():
 
 
 def test_a_panel_that_is_hardly_one():
-    """Steps that are nearly parallel: refused from 1e-9 on."""
+    """Steps that are nearly parallel are refused below an angle of 1e-9."""
     for angle, good in ((1.5e-9, True), (0.7e-9, False)):
         f = Rays(*(np.array([a]) for a in ([0, -9.0, 0], [0, 9.0, 0], [1.0, 0, 0], [1.0, 0, angle])), parallel=False)
         if good:

@@ -77,7 +77,7 @@ def variants(value, name):
 
 
 def in_short_form(beam, name):
-    """All numbers of a scan by views and of a circle, which the others have, too; what only the others have, and a motion."""
+    """Return whether the short form tests a number: all by views, all of CONE, those that views lack, and one motion a beam."""
     motion = dict(cone='COR', parallel='rotDetector', helix='height', circle='offDetector')
     return (
         beam == 'per_view'
@@ -104,7 +104,7 @@ def test_one_extreme_number(beam, name):
 
 @pytest.mark.parametrize('beam', [pytest.param(b, marks=pytest.mark.thorough if b == 'helix' else ()) for b in BEAMS])
 def test_extreme_numbers_together(beam):
-    """Each as far as it may go alone."""
+    """Each number is as large or small as it may be alone."""
     make, numbers, _ = BEAMS[beam]
     sizes = [name for name in ('DSO', 'DSD', 'dDetector', 'dVoxel', 'pitch') if name in numbers]
     for values in itertools.product((1e-12, 1e-6, 1.0, 1e6, 1e12), repeat=len(sizes)):
@@ -112,7 +112,7 @@ def test_extreme_numbers_together(beam):
 
 
 def test_usual_numbers_are_far_from_the_limits():
-    """Scans of a synchrotron with a detector of 10 nm, and of a parallel beam as a cone of 1000 km, in metres and nanometres."""
+    """They are a synchrotron with a detector of 10 nm and a parallel beam as a cone of 1000 km, in metres and nanometres."""
     for changes in (
         dict(DSO=1.5e5, DSD=1.5e5 + 1, dDetector=1e-5, dVoxel=1e-5),
         dict(DSO=1e9, DSD=1e9 + 100),

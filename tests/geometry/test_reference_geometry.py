@@ -118,7 +118,7 @@ class RTK:
 
 @pytest.mark.thorough
 def test_rtk_reads_the_geometry(name, tmp_path):
-    """RTK's own source positions, in the file that this package wrote."""
+    """From the file that this package wrote, RTK makes the same source positions."""
     g = geometry(name)
     if g.mode == 'parallel':
         pytest.skip('a parallel beam has no source')

@@ -35,7 +35,7 @@ def test_parts_that_overlap_count_twice():
 
 
 def test_a_mesh_over_the_edge_of_the_grid():
-    """A box from the middle of the grid to beyond its end, along each axis."""
+    """A box reaches from the middle of the grid to beyond its end, along each axis."""
     for axis in range(3):
         size, middle = np.full(3, 20.0), np.zeros(3)
         size[axis], middle[axis] = 10, 5

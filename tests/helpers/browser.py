@@ -87,7 +87,8 @@ def opened(browser, address, dark=False, offline=True, ready=True, first=''):
 
 
 def readout(page, row='crosshair'):
-    """The texts of a row of the table below the slices, by the names of its columns; the crosshair's once it has a place."""
+    """The texts of a row of the table below the slices, by the names of its columns. Wait until the crosshair's row has a
+    place."""
     if row == 'crosshair':
         page.locator('.readout tr[data-row=crosshair] td[data-name=voxel]', has_text=re.compile(r'\d')).wait_for()
     cells = page.locator(f'.readout tr[data-row={row}] td')

@@ -8,7 +8,7 @@ import numpy as np
 def matrix(geometry, axes: int = 2) -> np.ndarray:
     """Joseph's matrix, dense, [view * v * u, x * y * z], ray by ray and slice by slice in float64.
 
-    axes   among how many the main one is, from x on
+    axes   how many axes, from x on, may be the main one
     """
     frames, size, voxel = geometry.rays(), np.array(geometry.grid.shape), np.array(geometry.grid.spacing)
     first = np.array(geometry.grid.centre) + (voxel - geometry.grid.size) / 2
@@ -63,7 +63,8 @@ def assert_pair(kind: type, geometry, matrix: np.ndarray, masked: bool) -> None:
 
 
 def assert_kernels_serve_any_views(A) -> None:
-    """One kernel projects; two go back, the first weights the images. A: a projector of three views or more."""
+    """Require that one kernel projects and two go back (the first weights the images). A: a projector of three views or
+    more."""
     x = dr.opaque(mi.Float, 1.0, A.voxels)
 
     def both(views):

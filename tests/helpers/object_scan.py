@@ -12,7 +12,7 @@ phantom = functools.lru_cache(functools.partial(lm.phantom, size=SIZE))
 
 
 def scanned(name, mode='cone', views=25, total=360.0):
-    """A view of 12 degrees half a fan; the panel is higher than the object."""
+    """A scan of a phantom. Half the fan is about 12 degrees, and the panel is higher than the object."""
     made = phantom(name)
     side = max(made.spacing) * SIZE
     sizes = dict(nDetector=(110, PIXELS), nVoxel=SIZE, dVoxel=made.spacing, angles=circular(views, total))

@@ -15,7 +15,7 @@ def adds_in_any_order() -> bool:
 
 
 def assert_same(actual, expected):
-    """To the last bit, or up to rounding where sums are in any order."""
+    """Require equality to the last bit, or up to rounding if sums are in any order."""
     actual, expected = np.asarray(actual), np.asarray(expected)
     if adds_in_any_order():
         np.testing.assert_allclose(actual, expected, rtol=1e-5, atol=2e-6 * np.abs(expected).max())
@@ -32,5 +32,5 @@ def assert_same_volume(actual, expected):
 
 
 def fits_alike(otherwise: float) -> float:
-    """Relative tolerance of the measures of two like fits: where sums are in any order, a fit amplifies their rounding."""
+    """Relative tolerance of the measures of two like fits, which amplify rounding if sums are in any order."""
     return 1e-2 if adds_in_any_order() else otherwise

@@ -24,7 +24,7 @@ def in_use(path):
 
 
 def install(monkeypatch):
-    """For one test."""
+    """Keep these rules for one test."""
 
     def refusing(original, refused):
         def call(*paths, **options):

@@ -39,7 +39,7 @@ class Faults:
             return False
 
     def due(self, path, frees=False):
-        """Count a call. Whether it is to fail; frees: it needs no room."""
+        """Count a call and return whether it fails. With `frees`, the call needs no room on the disk."""
         if not self.within(path):
             return False
         self.count += 1
@@ -54,7 +54,7 @@ class Faults:
         raise OSError(number, os.strerror(number), None if isinstance(path, int) else path)
 
     def install(self):
-        """From here on, in this process, for ever."""
+        """Patch this process, from here on and for ever."""
         for name in ('replace', 'rename', 'mkdir', 'fsync', 'ftruncate', 'unlink', 'remove', 'rmdir', 'write', 'link'):
             setattr(os, name, self._wrapped(getattr(os, name), frees=name in ('unlink', 'remove', 'rmdir')))
         system_open = os.open

@@ -61,7 +61,7 @@ def only(scan, words):
 
 
 def test_axis_offset_is_measured(foot):
-    """Three columns, to a tenth."""
+    """An offset of three columns is measured to a tenth of a column."""
     moved = lm.Scan(foot.geometry, np.roll(foot.projections, 3, 2))
     shift = only(moved, 'the axis is off: add').orbit.shift
     assert shift == pytest.approx(-3 * foot.geometry.dDetector[1], abs=0.1 * foot.geometry.dDetector[1])
@@ -146,7 +146,8 @@ def test_air_and_truncation(foot):
 
 
 def noisy(p, level, kind):
-    """Noise of this part of the highest line integral, or of the beam's photons, for an object that lets 5 % through."""
+    """Projections with noise of `level`: of the highest line integral, or of the beam's photons if the object lets 5 %
+    through."""
     rng = np.random.default_rng(1)
     if kind == 'equal':
         return p + rng.normal(0, level * p.max(), p.shape)
@@ -163,7 +164,7 @@ def noisy(p, level, kind):
     ],
 )
 def test_noisy_pixels_are_not_the_object(mode, level, kind):
-    """Neither at the edge, nor where the axis is measured; an object that is there is found in as many views."""
+    """They are not at the edge, nor where the axis is measured; an object that is there is found in as many views."""
     scan = scanned('foot', mode, 60)
     assert advised(lm.Scan(scan.geometry, noisy(scan.projections, level, kind))) == []
     for part in (np.s_[:, :, 30:66], np.s_[:, 50:, :]):
@@ -177,7 +178,7 @@ def test_noisy_pixels_are_not_the_object(mode, level, kind):
 
 
 def test_an_object_at_a_corner_of_the_edge(foot):
-    """Five rows and two columns of a single view, and two pixels of another."""
+    """Five rows and two columns of a single view are an object, and two pixels of another view are not."""
     p = foot.projections.copy()
     p[3, 40:45, :2] = p.max()
     p[5, 40, :2] = p.max()
@@ -235,7 +236,7 @@ def test_air_of_single_views(foot):
 
 
 def test_a_small_drift_of_air_names_calibrate(foot):
-    """1 % of the highest line integral, up and down; nothing else is wrong."""
+    """Air drifts by 1 % of the highest line integral, up and down, and nothing else is found wrong."""
     p = foot.projections + np.linspace(-0.01, 0.01, len(foot))[:, None, None] * foot.projections.max()
     actual = only(lm.Scan(foot.geometry, p.astype(np.float32)), 'take it out with lingo-mi calibrate')
     assert actual.orbit.disagreement == pytest.approx(measure(foot).orbit.disagreement, abs=0.001)
@@ -267,7 +268,7 @@ def test_intensities(foot, counts):
 
 
 def test_what_is_no_intensity(foot):
-    """Blank views, air with its noise, and line integrals of either sign."""
+    """Blank views, air with its noise and line integrals of either sign are not taken for intensities."""
     p, rng = foot.projections / foot.projections.max() * 3, np.random.default_rng(0)
     noise = rng.normal(0, 0.02, p.shape)
     blank = p.copy()
@@ -297,7 +298,7 @@ def test_regions_of_interest_are_no_intensities():
 
 
 def test_noise(foot):
-    """Photons to 20 %."""
+    """The number of photons is measured to 20 %."""
     rng = np.random.default_rng(0)
     p = foot.projections / foot.projections.max() * 2
     noisy = -np.log(rng.poisson(2e4 * np.exp(-p)) / 2e4)
@@ -311,7 +312,7 @@ def dense():
 
 @pytest.mark.parametrize(('deviation', 'unsteady'), [(0.4, False), (1.5, True)])
 def test_jitter_is_measured(dense, deviation, unsteady):
-    """To 30 %, of 90 views."""
+    """It is measured to 30 % from 90 views."""
     by = np.random.default_rng(0).normal(0, deviation, (len(dense), 2))
     moved = np.stack([ndimage.shift(v, s, order=1) for v, s in zip(dense.projections, by)])
     scan = lm.Scan(dense.geometry, moved)

@@ -43,7 +43,7 @@ def done(results):
 
 
 def test_calls_are_divided(local):
-    """Among workers that keep the object, and among fewer when one has gone."""
+    """Workers that keep the object share the calls, and fewer do when one has gone."""
     actors, wanted = Actors(local, Squares()), [(i, i * i + 7) for i in range(5)]
     first, second = (actors.divided('squares', range(5), 7) for _ in range(2))
     assert done(first) == done(second) == wanted

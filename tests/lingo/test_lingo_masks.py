@@ -124,7 +124,7 @@ def test_views_that_the_panel_cuts_within_its_valid_pixels(axis):
 )
 @pytest.mark.parametrize('end', [0, -1])
 def test_views_that_the_panel_cuts(shape, axis, end):
-    """More than 1 in 20 pixels of a side, away from its corners. An axis of one pixel has no sides."""
+    """They have the object in more than 1 in 20 pixels of a side, away from its corners. An axis of one pixel has no sides."""
     length, across = shape[1 - axis], shape[axis]
     low = np.zeros((length // 20 + 2, *shape), bool)
     for count, image in enumerate(low):

@@ -214,7 +214,7 @@ def test_views_on_threads_keep_their_order_and_few_are_taken_in_advance():
 
 @pytest.mark.parametrize('name', ['psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d'])
 def test_the_plain_name_is_the_absolute_form(pair, name):
-    """In a unit whose full scale is not 1, with a wrong gain."""
+    """This holds in a unit whose full scale is not 1, and with a wrong gain."""
     images, truth = (4 * x for x in pair)
     plain, r2 = (getattr(metrics, n)(1.2 * truth, truth) for n in (name, f'{name}_r2'))
     assert plain == pytest.approx(getattr(metrics, name)(1.2 * truth / 4, truth / 4)) and plain != pytest.approx(r2)

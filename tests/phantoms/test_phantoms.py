@@ -310,7 +310,7 @@ def test_script_refuses(args, tmp_path, monkeypatch, capsys):
 
 @pytest.mark.parametrize('name', ['shepp_logan', 'foot'])
 def test_real_attenuation_is_that_of_bone(name):
-    """2000 HU at most, in the volume and in line integrals, of ellipsoids and of voxels."""
+    """It is 2000 HU at most, in the volume and in line integrals, of ellipsoids and of voxels."""
     plain, real = lm.phantom(name, size=16), lm.phantom(name, size=16, attenuation='real')
     bone = 3 * 0.0206
     np.testing.assert_allclose(real.data, bone * plain.data, rtol=1e-6)

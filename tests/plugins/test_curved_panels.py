@@ -56,7 +56,7 @@ def test_a_crop_window():
 
 
 def test_a_grid():
-    """A constant one is a block of that density: the lengths of rays in the box."""
+    """A constant grid is a block of that density: its image is the lengths of rays in the box, times it."""
     scene = load(dict(grid=grid(np.full((5, 4, 6), 1.3))), CURVED)
     start, direction = mitsuba_rays(scene.sensors()[0])
     with np.errstate(divide='ignore'):
@@ -74,7 +74,7 @@ def test_a_turned_instance_is_a_turned_scanner():
 
 
 def test_derivatives():
-    """Against a finite difference of the image."""
+    """They agree with a finite difference of the image."""
     scene = load(objects(), CURVED)
     params = mi.traverse(scene)
     values = params['cloud.density'].numpy().copy()

@@ -25,7 +25,7 @@ from lingo_mi.validation.oracle import relative
 
 @pytest.fixture(params=['mono', 'rgb'])
 def colour(request, variant):
-    """The variant under test, and its twin in colour."""
+    """The kind of the active variant: the variant under test, then its twin in colour."""
     mi.set_variant(variant.rsplit('_', 1)[0] + '_' + request.param)
     yield request.param
     mi.set_variant(variant)
@@ -54,7 +54,7 @@ def test_transmission(colour):
 
 
 def test_constant_grid_is_a_block():
-    """Both ways to write the same cuboid, projected by different code, and its chords in NumPy."""
+    """Two ways to write the same cuboid, projected by different code, agree with its chords in NumPy."""
     where = transform().translate([0.1, 0.2, 0.3]).scale([0.4, 0.5, 0.6])
     solid = dict(
         type='cube', to_world=where, bsdf=dict(type='null'), interior=dict(type='homogeneous', sigma_t=0.7, albedo=0.0)
@@ -122,7 +122,7 @@ def test_scene_gradients(colour):
 
 
 def test_forward_mode():
-    """The image's derivative along a direction in all parameters at once."""
+    """It gives the image's derivative along a direction in all parameters at once."""
     rng = np.random.default_rng(3)
     cloud, values = cloud_of(), values_of()
     by = {k: 0.01 * rng.normal(size=getattr(cloud, k).shape) for k in ('centre', 'scale', 'rotation', 'density')}

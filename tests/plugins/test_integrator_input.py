@@ -87,7 +87,7 @@ def test_an_albedo_may_be_a_grid_of_its_own_place():
 
 @pytest.mark.parametrize('size', [0.01, 1.0, 100.0])
 def test_a_grid_turned_by_less_than_can_be_told(size):
-    """Ten thousandth parts of its size are, a hundred thousandth part is not."""
+    """Some ten thousandths of its size are noticed, and a hundred thousandth is not."""
     turned = [grid(values_of(), transform().scale(size).rotate([0, 0, 1], angle)) for angle in (5e-4, 0.05)]
     render(load(dict(box=turned[0])))
     refused('must fill an axis-aligned cube', dict(box=turned[1]))

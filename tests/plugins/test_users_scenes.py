@@ -170,7 +170,7 @@ def test_batch_of_scanners():
 
 
 def test_batch_of_views():
-    """A batch of one scanner's views; its derivatives equal the derivatives of single views."""
+    """The derivatives of a batch of one scanner's views equal the derivatives of single views."""
     scanner = mi.load_dict(dict(SCANNER, angles='33, 50, 120'))
     batch = dict(type='batch', film=dict(FILM, width=90), **{f'v{i}': scanner.view(i) for i in range(3)})
     scene = load(dict(cloud=ellipsoids(cloud_of())), batch)

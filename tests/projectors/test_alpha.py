@@ -137,7 +137,7 @@ def test_derivatives_are_those_of_differences(mode):
 
 @pytest.mark.parametrize('width', [8, 1, 37])
 def test_one_gaussian_in_one_tile(width):
-    """At the middle of a pixel: its opacity times its radiance, and their derivatives."""
+    """At the middle of a pixel, the image is its opacity times its radiance, with their derivatives."""
     c = {name: np.array([value]) for name, value in dict(opacity=0.5, radiance=0.7).items()}
     c |= dict(centre=np.zeros((1, 3)), scale=np.full((1, 3), 1e-3), rotation=np.array([[0, 0, 0, 1.0]]))
     g = replace(geometry('parallel'), nDetector=(1, width), offDetector=(0.0, 0.0 if width % 2 else 9.0))

@@ -30,7 +30,7 @@ def test_values_that_several_parts_use():
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_the_projection_in_parts(mode):
-    """The derivatives of all eleven numbers of a footprint, as on a GPU and as on the CPU."""
+    """The derivatives of all eleven numbers of a footprint are right, as on a GPU and as on the CPU."""
     frames, shape = scanner(mode)
     assert isinstance(frames, Rays)
     cloud, view = random_cloud(np.random.default_rng(1), 12), View.of(frames, 0, *shape)

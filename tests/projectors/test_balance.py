@@ -71,7 +71,7 @@ def test_voxels(sharing):
 
 @by_sharing
 def test_meshes(sharing):
-    """Chords of a box, by the slabs between its faces."""
+    """Chords of a box agree with the slabs between its faces."""
     frames, shape = scanner()
     low, high = np.array([-0.7, -0.5, -0.4]), np.array([0.6, 0.8, 0.5])
     box = trimesh.creation.box(bounds=[low, high])
@@ -88,7 +88,7 @@ def test_meshes(sharing):
 @pytest.mark.parametrize('test', [test_images, test_voxels, test_meshes])
 @pytest.mark.parametrize('capability', [80, 90])
 def test_layouts_of_a_gpu(capability, test, monkeypatch):
-    """The lanes of a GPU's layout, on any machine."""
+    """The lanes of a GPU's layout give the same results on any machine."""
     monkeypatch.setattr(balance, '_on_cpu', lambda: False)
     monkeypatch.setattr(balance, 'gpu', lambda: SimpleNamespace(capability=capability))
     monkeypatch.setattr(balance, 'resident_warps', lambda: 8)
@@ -118,7 +118,8 @@ def test_as_many_shares_as_asked():
 
 @pytest.mark.parametrize('layout', [Layout(8, 1, 4), Layout(16, 2, 4), Layout(4, 8, 1)], ids=str)
 def test_packets_that_an_interval_covers(layout):
-    """All that hold one of its elements within the row, from the start of a step on, and none behind."""
+    """The interval covers all packets that hold one of its elements in the row, from the start of a step on, and none
+    behind."""
     width, rng = 27, np.random.default_rng(0)
     low, column = rng.uniform(-12, 40, 500), rng.integers(-3, 4, 500)
     high, offset = low + rng.uniform(-2, 9, 500), rng.uniform(-0.5, 0.5, 500)
@@ -137,7 +138,7 @@ def test_packets_that_an_interval_covers(layout):
 
 @pytest.mark.parametrize('shares', [0.125, 1, 20])
 def test_every_block_belongs_to_the_team_in_whose_share_it_begins(shares):
-    """Items of no block and of many, blocks that cost 1 and more; a team's share is the total over the teams, up to a whole."""
+    """Items have no block or many, and blocks cost 1 or more. A team's share is the total over the teams, rounded up."""
     blocks, costs, sharing = [3, 0, 2, 5, 0, 1, 40], [1, 1, 2, 3, 1, 1, 1], Sharing(shares=shares)
     work = Work.of(mi.UInt32(blocks), mi.UInt32(costs), sharing)
     share = work.shares(Layout(1, 1, 4))

@@ -29,7 +29,7 @@ def geometry(request):
 
 
 def columns_of(geometry):
-    """The same rays: each column of each view as a flat panel of its own, column by column."""
+    """The same rays, with each column of each view as a flat panel of its own, column by column."""
     rays, columns = geometry.rays(curved=True), range(geometry.nDetector[1])
     tops = np.array([rays.points(view, c + 0.5, 0.0) for view in range(len(geometry)) for c in columns])
     source, u, v = (np.repeat(a, len(columns), 0) for a in (rays.source, rays.u, rays.v))
@@ -49,7 +49,7 @@ def volume(geometry):
 
 
 def test_line_integrals(geometry, volume):
-    """The exact model to rounding; Joseph's likewise, as it depends on rays alone."""
+    """The exact model agrees to rounding, and so does Joseph's, which depends on rays alone."""
     columns = columns_of(geometry)
     same(project_volume(volume, geometry), geometry, project_volume(volume, columns))
     same(Projector(geometry, model='exact')(volume), geometry, project_volume(volume, columns))
@@ -66,7 +66,7 @@ def test_projector_classes():
 
 @pytest.mark.parametrize('kind', [Joseph, TiltedJoseph])
 def test_backprojections_agree(kind):
-    """For one voxel after the other, the pixels that gather it are the pixels that it is projected to."""
+    """Each voxel gathers the pixels that it is projected to."""
     geometry = GEOMETRIES['flying spot']
     A = kind(geometry)
     y = np.random.default_rng(1).random((3, *geometry.nDetector), np.float32)
@@ -80,7 +80,7 @@ def test_backprojections_agree(kind):
 
 
 def test_columns_of_positions(geometry):
-    """On the device as in float64, to a thousandth of a pixel: SLACK and the margins of Joseph's columns allow more."""
+    """The device agrees with float64 to a thousandth of a pixel; SLACK and the margins of Joseph's columns allow more."""
     curve = geometry.rays(curved=True).curve
     x = np.linspace(-2, 43, 400)
     for view in range(len(geometry)):
@@ -91,7 +91,7 @@ def test_columns_of_positions(geometry):
 
 
 def test_a_clinical_scanner():
-    """736 columns about the focal spot, a quarter of a pixel off, against line integrals of a Gaussian near the fan's edge."""
+    """736 columns about the focal spot, a quarter of a pixel off, see the line integrals of a Gaussian near the fan's edge."""
     centre, width, side = np.array([120.0, 110.0, 0.0]), 4.0, 64
     flat = Geometry.helix(
         DSO=595, DSD=1085.6, nDetector=(16, 736), dDetector=(1.2, 1.2858), offDetector=(0, 1.2858 / 4), pitch=12,

@@ -148,7 +148,7 @@ def test_tangents(scanner):
 
 @pytest.mark.parametrize('scanner', short({name: name for name in SCANNERS}, SHORT), indirect=True)
 def test_rigid_motions(scanner):
-    """The derivative by a turn and a shift of source and panel together."""
+    """Derivatives by a turn and a shift of source and panel together agree with differences of the oracle."""
     cloud, rays = cloud_of(), scanner.rays(curved=True)
     weights = np.random.default_rng(0).normal(size=np.prod(scanner.nDetector)).astype(np.float32)
     seen = view(scanner)
@@ -169,7 +169,7 @@ def test_rigid_motions(scanner):
 
 
 def test_functions_of_arrays():
-    """`project` and `GaussianProjector` of several views, and its transpose."""
+    """`project` of several views agrees with the oracle, and `GaussianProjector` with its transpose."""
     g = flat(angles=[0.6, 2.0, 4.4]).curved()
     cloud = cloud_of()
     columns = cloud.centre, cloud.scale, cloud.rotation, cloud.density

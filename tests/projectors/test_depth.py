@@ -16,7 +16,7 @@ def depth_of(places, shape, covered=1.0):
 
 @pytest.mark.parametrize('shape', SHAPES.values(), ids=SHAPES)
 def test_a_pile_in_one_element(shape):
-    """With others all around it."""
+    """A pile is found with others all around it."""
     rng, count = np.random.default_rng(0), 2 * deep()
     around = [rng.integers(0, n, 500) for n in shape]
     pile = [np.full(count, n // 3) for n in shape]
@@ -31,7 +31,7 @@ def test_items_in_elements_of_their_own(shape):
 
 @pytest.mark.parametrize('shape', SHAPES.values(), ids=SHAPES)
 def test_items_that_cover_everything(shape):
-    """They overlap with their centres anywhere; different numbers are added, which counts RANDOM times less."""
+    """They overlap wherever their centres are. As they add different numbers, they count RANDOM times less."""
     rng, count = np.random.default_rng(0), 4 * deep()
     places = [rng.integers(0, n, count) for n in shape]
     depth = depth_of(places, shape, float(np.prod(shape)))
@@ -39,7 +39,7 @@ def test_items_that_cover_everything(shape):
 
 
 def test_large_clouds_are_sampled():
-    """100,000 items, every tenth of them in one place: to a tenth."""
+    """Of 100,000 items every tenth is in one place, and the depth is found to a tenth."""
     rng, count = np.random.default_rng(0), 100_000
     at = np.where(np.arange(count) % 10 == 0, 5, rng.integers(0, 70, count)), rng.integers(0, 300, count)
     at[1][::10] = 7

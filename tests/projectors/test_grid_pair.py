@@ -94,13 +94,13 @@ def test_which_projector_a_scan_gets():
     ],
 )
 def test_helix(name, views, options):
-    """Two turns that climb by 20 mm each."""
+    """The ball comes back from two turns that climb by 20 mm each."""
     geo = spiral(geometry(angles=4 * np.pi * np.arange(views) / views), 20.0)
     assert_ball(run_algorithm(ellipsoids(geo, BALL), ALGORITHMS[name](**options)).volume, geo)
 
 
 def test_pixels_left_out_count_for_nothing():
-    """A quarter of the pixels dead, whatever stands in them; taken for zero they spoil the volume."""
+    """A quarter of the pixels is dead, whatever stands in them. Taken for zero, they would spoil the volume."""
     geo = geometry(angles=circular(40, start=3))
     whole = ellipsoids(geo, BALL)
     valid = np.random.default_rng(0).random(whole.projections.shape) < 0.75

@@ -103,7 +103,7 @@ def test_constant_cube_gives_the_chord():
 
 
 def test_linear_ramp_between_the_outer_centres():
-    """x at voxel centres: the integral over [1/2, n - 1/2] along x is the mean times the length."""
+    """With x at voxel centres, the integral over [1/2, n - 1/2] along x is the mean times the length."""
     n = 8
     volume = np.broadcast_to(np.arange(n)[:, None, None] + 0.5, (n, 3, 3))
     direction = np.array([[1.0, 0.05, 0.02]])
@@ -239,7 +239,7 @@ def test_errors():
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_origins_of_rays_are_near_the_volume(mode):
-    """On a plane through its centre: the distance of a source costs no digits."""
+    """They lie on a plane through its centre, so that the distance of a source costs no digits."""
     geometry = scan(mode)
     table = view_table(geometry).astype(float)
     centre, source = table[:, :3], table[:, 9:12] / np.linalg.norm(table[:, 9:12], axis=1, keepdims=True)

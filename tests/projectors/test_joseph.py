@@ -64,7 +64,7 @@ def test_transpose(changes):
 
 
 def test_rays_along_all_faces_of_the_volume_are_alike():
-    """To the last bit on a face, they see the voxels beside it, there and back."""
+    """Rays on a face, to the last bit, see the voxels beside it, forward and back."""
     geometry = CircularGeometry(
         DSO=8.0, DSD=8.0, nDetector=(6, 5), dDetector=1.0, angles=[0.0], mode='parallel', grid=Grid((3, 4, 5), 1.0)
     )
@@ -78,7 +78,7 @@ def test_rays_along_all_faces_of_the_volume_are_alike():
 
 
 def test_voxels_beside_a_ray_add_nothing_whatever_they_hold():
-    """Rays through voxel centres, and half a voxel beyond the outermost: the neighbours have no weight."""
+    """If rays pass voxel centres, or half a voxel beyond the outermost, the neighbours have no weight."""
     geometry = CircularGeometry(
         DSO=8.0, DSD=8.0, nDetector=(3, 3), dDetector=1.0, angles=[0.0], mode='parallel', grid=Grid((3, 3, 3), 1.0)
     )
@@ -119,7 +119,8 @@ def test_kernels_serve_any_views():
 
 
 def test_scans_it_does_not_serve():
-    """The volume reaches beyond the source, or so near that a voxel would cover hundreds of rows; a panel leans or is turned."""
+    """In these, the volume reaches beyond the source, or so near that a voxel would cover hundreds of rows, or a panel leans or
+    is turned."""
     lean = np.array([0, 1e-3, 0])
     others = [
         scan(DSO=15.0, DSD=300.0),

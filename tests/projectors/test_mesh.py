@@ -69,7 +69,7 @@ def paths_of(mesh):
 
 
 def close(image, expected, size, tolerance=1e-6):
-    """Equal at every pixel to a millionth of the mesh's size, and to 1e-5 where the chord is not short."""
+    """Require equality at every pixel to a millionth of the mesh's size, and to 1e-5 where the chord is not short."""
     np.testing.assert_allclose(image, expected, rtol=0, atol=tolerance * size)
     long = expected > 0.1 * size
     assert long.any()

@@ -95,7 +95,7 @@ def test_equal_to_traced_calls(traced, again):
 
 
 def test_compiles_nothing_anew():
-    """Whatever the number of Gaussians, and however a call is made."""
+    """This holds whatever the number of Gaussians, and however a call is made."""
     image_and_gradients(cloud(150), view(), CLOUD, True)
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
@@ -127,7 +127,7 @@ def test_from_rows():
 
 
 def test_derivatives_alone():
-    """Without the image, as `mi.render` asks for in its backward pass."""
+    """They are the same without the image, as `mi.render` asks for them in its backward pass."""
     gaussians = cloud(200)
     with_image, without = (
         image_and_gradients(gaussians, view(), CLOUD, True, primal=primal) for primal in (True, False)

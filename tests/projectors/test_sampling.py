@@ -16,7 +16,7 @@ def grid(values, step=(1.0, 1.0, 1.0)):
 @pytest.mark.parametrize('over', [2, 3, 4])
 @pytest.mark.parametrize('axis', [0, 1, 2])
 def test_means_over_larger_voxels(axis, over):
-    """Several times as large along one axis, and no other axis is smoothed."""
+    """Voxels are several times as large along one axis, and no other axis is smoothed."""
     values = np.random.default_rng(0).random((12, 12, 12))
     step, shape = np.ones(3), [12, 12, 12]
     step[axis], shape[axis] = over, 12 // over
@@ -38,7 +38,7 @@ def test_means_lie_in_the_middle_of_their_voxels(over):
 
 @pytest.mark.parametrize('axis', [0, 1, 2])
 def test_smaller_voxels_are_interpolated_within_the_box(axis):
-    """A ramp, held for half a voxel at its ends, and nothing outside."""
+    """A ramp is held for half a voxel at its ends, and outside there is nothing."""
     values = np.moveaxis(np.broadcast_to(np.arange(1.0, 6)[:, None, None], (5, 4, 3)), 0, axis)
     step, corner, shape = np.ones(3), LOW.copy(), list(values.shape)
     step[axis], shape[axis] = 0.5, 14

@@ -170,7 +170,7 @@ def test_quaternions_need_no_unit_length(mode):
 
 
 def test_cut_off_bounds_the_error():
-    """A smaller extent loses what lies beyond it, no more: the price list in the integrator's docstring."""
+    """A smaller extent loses only what lies beyond it, as in the price list of the integrator's docstring."""
     frames, shape = scanner()
     cloud = random_cloud(np.random.default_rng(9), 30)
     exact = oracle.line_integrals(cloud, Pose.of(frames, 0, *shape))
@@ -263,7 +263,7 @@ def test_tangent_of_the_splat_is_the_adjoint_of_its_gradient(name):
 
 @pytest.mark.parametrize('name', ['cone', 'parallel', 'cone, tilted', 'cone, close'])
 def test_tangent_of_line_integrals(name):
-    """Against the gradient, and against the oracle; with one Gaussian around a cone beam's source."""
+    """Tangents agree with the gradient and with the oracle, also for a Gaussian around a cone beam's source."""
     frames, shape = VIEWS[name]
     rng = np.random.default_rng(11)
     cloud = random_cloud(rng, 9)
@@ -326,9 +326,9 @@ def test_same_bits_every_time(mode, sums_in_order):
 
 
 def test_powers_of_two(variant):
-    """To float32's rounding, exact for whole numbers, and nothing but small where float32 ends.
+    """They are right to float32's rounding, exact for whole numbers, and small where float32 ends.
 
-    On a GPU by its instruction `ex2.approx`, which may err by two units in the last place (PTX ISA, 9.7.3).
+    A GPU has its instruction `ex2.approx`, which may err by two units in the last place (PTX ISA, 9.7.3).
     """
     x = np.concatenate([np.linspace(-125.9, 0, 100_001), -np.logspace(-40, 0, 1000), np.arange(-125, 1)]).astype(
         np.float32
@@ -375,7 +375,8 @@ def test_gaussians_within_the_limits_are_usable(name, within, beyond):
 
 
 def test_depth_of_items_that_fill_a_cell():
-    """8192 in the 64 elements of one cell, 128 at each; as they lie at random, only one in 32 of the cell's counts."""
+    """8192 items lie in the 64 elements of one cell, 128 at each. As they lie at random, only one in 32 of the cell's
+    counts."""
     i = np.arange(8192)
     places = [mi.Int32(p) for p in (i % 8, i // 8 % 8)]
     assert deepest(places, dr.full(mi.Float, 1, 8192), (512, 512)).numpy() == 128
@@ -396,7 +397,7 @@ def test_gaussians_at_the_source_are_announced_where_options_cannot_hold(options
 
 
 def test_needles_along_the_ray_that_cannot_be_widened_are_announced():
-    """Thinner than a pixel, and long: their integrals are those at the pixels' centres."""
+    """Long needles, thinner than a pixel, have their integrals at the pixels' centres."""
     view = View.of(*scanner_of(1000, 1500, 65, 1.0))
     turn = Rotation.align_vectors([[1, 0, 0]], [[0, 0, 1]])[0].as_quat()
     gaussians = mi.Point3f(0), mi.Vector3f(0.02, 0.02, 100), mi.Vector4f(*turn.tolist()), mi.Float(1)

@@ -65,7 +65,7 @@ def test_transpose(geometry):
 
 
 def test_before_an_upright_panel_it_is_the_other():
-    """No ray of these is steeper than its fan."""
+    """This holds because no ray is steeper than its fan."""
     geometry = scan(n=3, nVoxel=(16, 16, 8), dVoxel=2.0)
     x = mi.Float(np.random.default_rng(0).random(16 * 16 * 8, dtype=np.float32))
     expected, actual = (kind(geometry).forward(x, range(3))[0].numpy() for kind in (Joseph, TiltedJoseph))
@@ -73,7 +73,7 @@ def test_before_an_upright_panel_it_is_the_other():
 
 
 def test_slabs_add_up():
-    """Each between slices of zeros, as `slab_sweeps` projects them."""
+    """Each slab is projected between slices of zeros, as by `slab_sweeps`."""
     geometry = posed(tilted(*STEEP))
     volume = np.random.default_rng(0).random(geometry.grid.shape, dtype=np.float32)
     A = TiltedJoseph(geometry)

@@ -104,7 +104,7 @@ def test_order_is_x_fastest():
 
 
 def test_cut_off():
-    """Beyond the extent there is nothing, within it all."""
+    """Beyond the extent there is nothing, and within it everything."""
     grid, cloud = boxed((21, 21, 21)), Cloud([[0.03, 0.01, -0.02]], [[0.2, 0.15, 0.25]], [[0.1, 0.2, 0.3, 0.9]], [1.0])
     points = centres(*grid)
     squared = (oracle.whiten(cloud.scale[0], cloud.rotation[0], points - cloud.centre[0]) ** 2).sum(1)

@@ -37,7 +37,8 @@ def directions(source, points):
 @pytest.mark.parametrize('shape', ['CYLINDRICAL', 'FLAT'])
 @pytest.mark.parametrize('stored', [dict(), dict(direct=True), dict(implicit=True)], ids=str)
 def test_every_ray_of_a_ct_pd_scan(tmp_path, flying, shape, stored):
-    """From the focal spot to the element of the manual's formulas, and its line integral: to what float32 attributes hold."""
+    """Rays run from the focal spot to the element of the manual's formulas, as exactly as float32 attributes say, and hold
+    their line integrals."""
     scanner = CTPD(views=7, turns=1.3, flying=flying, shape=shape)
     p = scanner.projections(SPHERES)
     scanner.write(tmp_path / 'scan', p, **stored)
@@ -52,7 +53,7 @@ def test_every_ray_of_a_ct_pd_scan(tmp_path, flying, shape, stored):
 
 @pytest.mark.filterwarnings('ignore:.*projections may be truncated')
 def test_a_helical_ct_pd_scan_is_reconstructed(tmp_path, monkeypatch):
-    """Two balls, their line integrals by a closed form; the command imports the folder, CGLS finds densities and places."""
+    """The command imports two balls with closed-form line integrals, and CGLS finds their densities and places."""
     scanner = CTPD(views=90, flying=True)
     scanner.write(tmp_path / 'scan', scanner.projections(SPHERES))
     monkeypatch.setattr(sys, 'argv', ['lingo-mi', 'import', str(tmp_path / 'scan'), '--out', str(tmp_path / 's.npy')])
@@ -155,7 +156,7 @@ def test_a_rotational_run_of_angiography(tmp_path, steps, secondary):
 
 
 def test_single_frames_and_what_turns_them(tmp_path):
-    """A file a view; PatientOrientation says that columns run to the right hand."""
+    """There is one file a view, and PatientOrientation says that columns run to the right hand."""
     (tmp_path / 'run').mkdir()
     primary = np.array([-80.0, 10.0, 100.0])
     sources, pixels = c_arm(primary, np.zeros(3))
@@ -171,7 +172,7 @@ def test_single_frames_and_what_turns_them(tmp_path):
 
 
 def test_enhanced_angiography(tmp_path):
-    """Angles in the groups of the frames, distances in the group of all."""
+    """Angles are in the groups of the frames, distances in the group of all."""
     Dataset, Sequence = pydicom.Dataset, pydicom.Sequence
     frames = []
     for angle in (0.0, 40.0):

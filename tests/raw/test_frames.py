@@ -82,7 +82,7 @@ def test_pictures_in_colours(tmp_path, mode):
 
 
 def write_his(path, image):
-    """Elekta's format: a header of 68 bytes with corners, count and type, 32 further bytes, then the counts."""
+    """Write Elekta's format: a header of 68 bytes with corners, count and type, 32 further bytes, then the counts."""
     header, n = bytearray(100), len(image)
     header[:4] = 0, 0x70, 68, 0
     struct.pack_into('<H', header, 10, 32)
@@ -162,7 +162,7 @@ def test_damaged_frame(tmp_path, raw, scan_yml):
 
 @pytest.mark.parametrize('content', ['number', 'group', 'text', 'angles'])
 def test_files_of_another_structure(tmp_path, scan_yml, content):
-    """One line, whatever they hold in the place of frames."""
+    """They give one line, whatever they hold in the place of frames."""
     h5py = pytest.importorskip('h5py')
     path = tmp_path / ('a.npy' if content == 'number' else 'a.h5')
     if content == 'number':
@@ -180,7 +180,7 @@ def test_files_of_another_structure(tmp_path, scan_yml, content):
 
 
 def test_a_stack_of_one_page(tmp_path):
-    """ImageJ writes stacks of more than 4 GB so."""
+    """ImageJ writes stacks of more than 4 GB with a single page."""
     stack = np.random.default_rng(0).integers(100, 9000, (6, 8, 10)).astype(np.uint16)
     tifffile.imwrite(tmp_path / 'stack.tif', stack, truncate=True)
     views = open_recording(tmp_path / 'stack.tif').views
@@ -210,7 +210,7 @@ def test_colours_are_refused(tmp_path, scan_yml):
 
 @pytest.mark.parametrize('several', [False, True])
 def test_a_cut_off_edf(tmp_path, raw, scan_yml, several):
-    """fabio would fill up what is missing."""
+    """It is refused, because fabio would fill up what is missing."""
     image = pytest.importorskip('fabio').edfimage.EdfImage(data=raw.views[0])
     if several:
         for frame in raw.views[1:]:

@@ -36,7 +36,7 @@ def test_photons(tmp_path, scan_yml):
 
 @pytest.mark.parametrize('what', ['bad pixels', 'rings', 'all pixels are valid', 'a view is black'])
 def test_into_a_zarr(tmp_path, scan_yml, monkeypatch, what):
-    """A few views at a time, and the same as in memory: line integrals, mask, history and geometry."""
+    """A few views are written at a time. Line integrals, mask, history and geometry are the same as in memory."""
     zarr = pytest.importorskip('zarr')
     n = 30 if what == 'rings' else 6
     raw = raw_frames(n=n, shape=(12, 300) if what == 'rings' else (24, 40))
@@ -73,7 +73,7 @@ def test_into_a_zarr(tmp_path, scan_yml, monkeypatch, what):
 
 
 def test_an_import_into_a_zarr_that_fails(tmp_path, raw, scan_yml, capsys, monkeypatch):
-    """Leaves nothing. An earlier scan stays."""
+    """It leaves nothing, and an earlier scan stays."""
     pytest.importorskip('zarr')
     out = tmp_path / 'out' / 'a.zarr'
     files = [str(tmp_path / f'{name}.npy') for name in ('views', 'flats', 'darks')]
@@ -96,7 +96,7 @@ def test_an_import_into_a_zarr_that_fails(tmp_path, raw, scan_yml, capsys, monke
 
 
 def test_without_noise_exact(tmp_path, scan_yml):
-    """Rounding to counts is all that is left: half a count of 20 000 exp(-2)."""
+    """Only rounding to counts is left: half a count of 20 000 exp(-2)."""
     raw = raw_frames(noise=False)
     scan = load(save(tmp_path, raw) and tmp_path / 'views.npy', scan_yml, **save(tmp_path, raw))
     assert np.abs(scan.projections - raw.truth)[scan.valid].max() < 1e-3
@@ -207,7 +207,7 @@ def test_import_writes_a_scan_with_its_history(tmp_path, raw, scan_yml, monkeypa
 
 @pytest.mark.parametrize('which', ['darks', 'flats'])
 def test_dead_pixels_that_are_nan(tmp_path, raw, scan_yml, which):
-    """In floating-point darks or flats they are masked, and change nothing else."""
+    """In floating-point darks or flats, such pixels are masked, and change nothing else."""
     paths = save(tmp_path, raw)
     frames = getattr(raw, which).astype(np.float32)
     plain = load(tmp_path / 'views.npy', scan_yml, **paths)

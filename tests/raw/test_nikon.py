@@ -50,7 +50,7 @@ def test_scan(tmp_path, xtekct):
 
 
 def test_binning_that_leaves_columns_over(tmp_path, xtekct):
-    """Eight columns by three: those that the panel's pixels leave out are not counted, wherever they stand in the frame."""
+    """If eight columns are binned by three, those that are left over do not count, wherever they stand in the frame."""
     p = np.random.default_rng(0).uniform(0, 2, (4, 6, 8)).astype(np.float32)  # in our order
     np.save(tmp_path / 'v.npy', 60000 * np.exp(-p[:, :, ::-1]))
     scan = lm.load_raw(tmp_path / 'v.npy', xtekct, progress=False, binning=3)

@@ -88,7 +88,7 @@ def scan_of(tmp_path):
 
 
 def test_skyscan(scan_of):
-    """The panel's pixel is four of the camera's: its calibrated size at the object says so."""
+    """The panel's pixel is four of the camera's, as its calibrated size at the object says."""
     geometry = scan_of('.log').geometry
     assert (geometry.DSO, geometry.DSD) == (200.89, 273.83609)
     np.testing.assert_allclose(geometry.dDetector, 4 * 0.009, rtol=2e-4)
@@ -120,7 +120,7 @@ def test_nsi(scan_of):
 
 
 def test_nsi_with_a_turned_panel(scan_of):
-    """Rows at 2 degrees to the plane of rotation: poses, the same rays as by the vectors themselves."""
+    """If rows are at 2 degrees to the plane of rotation, poses hold the rays of the file's own vectors."""
     c, s = np.cos(np.radians(2)), np.sin(np.radians(2))
     geometry = scan_of('.nsipro', '<horizontal>-1 0 0', f'<horizontal>{-c} {s} 0').geometry
     rays = geometry.rays()
@@ -132,7 +132,7 @@ def test_nsi_with_a_turned_panel(scan_of):
 
 
 def test_nsi_as_mbirjax_reads_it():
-    """The numbers of a circle, its signs included, by the functions of MBIRJAX's own reader."""
+    """The numbers of a circle, signs included, are those of the functions of MBIRJAX's own reader."""
     nsi = pytest.importorskip(
         'mbirjax.preprocess.nsi', reason="MBIRJAX is not installed: pip install -e '.[reference]'"
     )

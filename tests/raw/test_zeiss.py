@@ -39,7 +39,7 @@ def load(path, **options):
 
 @pytest.mark.parametrize('kind', [5, 10], ids=['uint16', 'float32'])
 def test_scan(tmp_path, kind):
-    """Line integrals from its own reference; the panel at the scintillator, 3 x 20 um a pixel."""
+    """Line integrals come from the file's own reference. The panel is at the scintillator, with pixels of 3 x 20 um."""
     raw = raw_frames(noise=False)
     write_ole2(tmp_path / 'a.txrm', content(raw, kind))
     np.save(tmp_path / 'd.npy', raw.darks)
@@ -66,7 +66,7 @@ def test_more_than_a_hundred_frames_and_several_references(tmp_path):
 
 
 def test_shifts_move_the_panel(tmp_path):
-    """x to the right and y down, pixels; and the centre's for all views."""
+    """Shifts are in pixels, x to the right and y down, and the centre's shift is for all views."""
     raw = raw_frames()
     x, y = np.arange(6, dtype='<f4'), np.full(6, 2, '<f4')
     shifts = {'alignment__x_shifts': x, 'alignment__y_shifts': y, 'ReconSettings__CenterShift': np.float32(1.5)}

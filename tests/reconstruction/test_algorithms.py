@@ -96,7 +96,7 @@ def test_defaults_are_tigres():
 
 
 def test_iterations_by_default():
-    """Our own; the tables in the docs are made with them."""
+    """The numbers are our own, and the tables in the docs are made with them."""
     expected = {
         'sart': 20,
         'os-sart': 50,

@@ -64,8 +64,8 @@ def test_no_start():
 
 
 def test_the_score_is_the_error_of_the_volume_smooth_or_not():
-    """Errors of a tenth of the truth's norm, from smooth ones to independent voxels. Plain residuals hide the latter, which
-    cancel along the rays. Of an error of independent voxels, trilinear interpolation takes a third to a half away."""
+    """Errors of a tenth of the truth's norm are smooth, or independent from voxel to voxel. Plain residuals hide the latter,
+    which cancel along the rays. Trilinear interpolation takes a third to a half off such an error."""
     scan, truth = scanned(1)
     rng = np.random.default_rng(1)
     x, y, _ = np.indices(truth.shape) - 11.5
@@ -199,7 +199,7 @@ def finer_scan():
 
 @pytest.mark.thorough
 def test_values_predict_views_and_means_the_truth(finer_scan):
-    """The numbers cannot be good at both: see docs/how_to/best.md."""
+    """No numbers are good at both: see docs/how_to/best.md."""
     scan, rest, truth = finer_scan
     results = {kind: run_algorithm(scan, Best(niter=4, voxels=kind)) for kind in ('means', 'values', 'finer')}
     pocs = run_algorithm(scan, ASDPOCS(niter=50)).volume

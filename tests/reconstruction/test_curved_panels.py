@@ -37,7 +37,7 @@ def test_iterative(name, views, options):
 
 
 def test_penalised():
-    """The ball from a strongly bent panel; from one that is hardly bent, the volume of the flat one."""
+    """A strongly bent panel gives the ball, and one that is hardly bent gives the volume of the flat one."""
     algorithm = PenalisedLeastSquares(strength=1e-3, niter=40)
     coarse = dict(nDetector=(32, 50), dDetector=(6.0, 8.0), nVoxel=(24, 24, 24), dVoxel=6.0)
     measured = ellipsoids(geometry(angles=circular(20), **coarse).curved(), BALL)
@@ -62,7 +62,7 @@ def test_penalised():
     ],
 )
 def test_fdk(offset, radius):
-    """Centred, a quarter of a pixel off, and far to one side, as from a flat panel."""
+    """A panel that is centred, a quarter of a pixel off, or far to one side gives the ball, like a flat panel."""
     measured = scan(180, offset, radius)
     volume = run_algorithm(measured, FDK()).volume
     assert_ball(volume, measured.geometry)

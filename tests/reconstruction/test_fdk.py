@@ -35,7 +35,7 @@ def test_asymmetric_phantom_axis_by_axis():
 
 @pytest.mark.parametrize('span', [215, 230, 280])
 def test_parker_weights_on_a_short_scan(span):
-    """A panel that spans 31 degrees of fan needs 211; rays measured twice must not count twice."""
+    """A panel that spans 31 degrees of fan needs views over 211. Rays that are measured twice must not count twice."""
     geo = geometry(angles=circular(span, span, start=40)[::-1])
     volume, near = run_algorithm(ellipsoids(geo, BALL), FDK()).volume, np.linalg.norm(centres(geo) - BALL[0], axis=-1)
     assert np.sqrt(np.mean((volume[near < 20] / 0.02 - 1) ** 2)) < 0.005  # unweighted: 0.02 to 0.04
@@ -123,7 +123,7 @@ def test_filters_keep_the_density():
 
 
 def test_windows():
-    """At zero, half and the whole of the Nyquist frequency."""
+    """They are right at zero, half and the whole of the Nyquist frequency."""
     f = np.array([0, 0.5, 1])
     for name, expected in {
         'ram-lak': [1, 1, 1],
@@ -137,7 +137,7 @@ def test_windows():
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_filtering_in_other_units(mode):
-    """All lengths twice as long: the same cosines, and per mm half as much."""
+    """If all lengths are twice as long, cosines stay, and values per mm are half as large."""
     once = geometry(mode, circular(3))
     lengths = 'DSO', 'DSD', 'dDetector', 'offDetector'
     grid = replace(once.grid, spacing=np.multiply(once.grid.spacing, 2), centre=np.multiply(once.grid.centre, 2))
@@ -149,7 +149,7 @@ def test_filtering_in_other_units(mode):
 
 @pytest.mark.parametrize('side', ['u', 'v'])
 def test_the_cosine_is_that_of_the_offset_panel(side):
-    """A row far from the axis: what FDK weighs it by is DSD over the ray's length to each pixel."""
+    """FDK weighs a row far from the axis by DSD over the ray's length to each pixel."""
     offset = (0.0, 60.0) if side == 'u' else (60.0, 0.0)
     geo = geometry(angles=[0.0], nDetector=(1, 1), dDetector=(2.0, 3.0), offDetector=offset)
     centred = geometry(angles=[0.0], nDetector=(1, 1), dDetector=(2.0, 3.0), offDetector=(0.0, 0.0))
@@ -245,7 +245,7 @@ def test_measured_fan_beam(data):
 
 
 def test_all_four_edges_of_the_panel_are_alike():
-    """Voxel centres on the edges, to the last bit: none is seen, whichever edge it is."""
+    """Voxel centres on an edge, to the last bit, are not seen, whichever edge it is."""
     geo = CircularGeometry(
         DSO=8.0, DSD=8.0, nDetector=(4, 4), dDetector=1.0, angles=[0.0], mode='parallel', grid=Grid((3, 5, 5), 1.0)
     )

@@ -31,7 +31,7 @@ def kinds(scan):
     ('kind', 'share'), [('column', 0.1), ('dead', 0.1), ('single', 0.1), ('row', 0.2), ('view', 0.2)]
 )
 def test_filled_pixels(scan, kind, share):
-    """To a tenth of their values, rms; a whole row or view to a fifth. What was measured stays."""
+    """They are right to a tenth of their values, rms, and a whole row or view to a fifth. Measured pixels stay."""
     valid = kinds(scan)[kind]
     with pytest.warns(UserWarning, match='that are not valid were filled'):
         actual = filled(replace(scan, valid=valid))

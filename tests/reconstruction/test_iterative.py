@@ -245,7 +245,7 @@ def test_asd_pocs_is_the_transcription(system):
 
 @pytest.mark.parametrize('share', [1.0, 0.95])
 def test_asd_pocs_meets_exact_line_integrals(share):
-    """Corrected for what Joseph's projector is off, the volume's exact line integrals meet the projections; else Joseph's do.
+    """With the correction for Joseph's error, the volume's exact line integrals meet the projections; without it, Joseph's do.
 
     share   of the pixels that are valid
     """
@@ -362,7 +362,7 @@ def test_structure_is_where_a_volume_changes():
 
 
 def test_refined_puts_what_is_missing_where_the_structure_is():
-    """From a start that is blurred, as a cloud's, the weights find more of it again than equal ones."""
+    """If the start is blurred, like a cloud's volume, the weights recover more of what is missing than equal weights do."""
     made = phantoms.make('foot', 48)
     geo = default_geometry(made, circular(12, 180.0), 96)
     scan = Scan(geo, project_volume(made.data, geo))
@@ -376,8 +376,8 @@ def test_refined_puts_what_is_missing_where_the_structure_is():
 
 
 def test_smaller_voxels_hold_what_an_object_has_between_them():
-    """An object scanned on half the voxels' size: on its own voxels `refined` makes less of it than on the smaller ones, whose
-    means it gives, from a start that is not better."""
+    """The object has detail of half a voxel. `refined` on voxels of half the size, whose means it gives, is better than on the
+    scan's, though its start is not."""
     made = phantoms.make('foot', 48)
     geo = default_geometry(made, circular(30, 180.0), 96)
     scan = Scan(geo, project_volume(made.data, geo))
@@ -434,7 +434,7 @@ def test_scans_off_the_circle_and_invalid_pixels_are_refused(algorithm):
 
 
 def test_what_counts_as_matched_where_fdk_cannot_say(system):
-    """Nothing, so that the descent stays in bounds."""
+    """Nothing does, so that the descent stays in bounds."""
     geo = small(n=5)
     moved = Geometry.from_poses(
         geo.rays().moved(shift=np.array([0, 0, 1.0]) * np.arange(5)[:, None]),
@@ -455,6 +455,6 @@ def test_passes_between_corrections(system, monkeypatch, every, times):
 
 
 def test_blocks_go_by_their_middle_view():
-    """At 10, 40 and 120 degrees; the first views of the blocks would give another order."""
+    """The middle views are at 10, 40 and 120 degrees; the first views would give another order."""
     actual = blocks(np.radians([0, 10, 170, 40, 60, 120]), 2, 'angularDistance', np.random.default_rng(0))
     assert [b.tolist() for b in actual] == [[0, 1], [4, 5], [2, 3]]

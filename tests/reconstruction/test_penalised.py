@@ -48,7 +48,7 @@ def scan():
 
 @pytest.mark.thorough
 def test_the_minimum_does_not_depend_on_the_start(scan):
-    """The problem is convex, so the least volume is one, whatever the start."""
+    """The problem is convex, so it has one minimum, whatever the start."""
     scan, truth = scan
     algorithm = PenalisedLeastSquares(TV(inner=40), strength=3e-4, niter=400)
     a = run_algorithm(scan, algorithm).volume
@@ -68,7 +68,7 @@ def test_the_minimum_does_not_depend_on_the_start(scan):
 
 @pytest.mark.thorough
 def test_the_strength_is_chosen(scan):
-    """Near the best one of the path, which the truth shows."""
+    """It is near the best one of the path, which the truth shows."""
     scan, truth = scan
 
     def quality(strength):
@@ -84,7 +84,7 @@ def test_the_strength_is_chosen(scan):
 
 @pytest.mark.parametrize('weights', ['equal', 'photons'])
 def test_gradients_and_weights(weights):
-    """A quadratic prior, bounds and weights: the minimum that SciPy finds of the same matrix."""
+    """With a quadratic prior, bounds and weights, the minimum is the one that SciPy finds with the same matrix."""
     geo = lm.Geometry.parallel(nDetector=(6, 9), dDetector=1, nVoxel=(5, 5, 4), dVoxel=1, angles=lm.circular(6))
     A = lm.Projector(geo)
     b = A(np.random.default_rng(0).random(A.domain_shape)) + np.random.default_rng(1).normal(size=A.range_shape)

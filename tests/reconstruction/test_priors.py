@@ -54,7 +54,7 @@ def test_total_variation_is_the_least(noisy, strength, upper):
 
 
 def test_total_variation_is_that_of_scikit_image(noisy):
-    """scikit-image has the same differences but no bounds: far above zero there are none."""
+    """scikit-image has the same differences but no bounds, which have no effect far above zero."""
     expected = denoise_tv_chambolle(noisy + 5, weight=0.2, eps=1e-9, max_num_iter=3000)
     np.testing.assert_allclose(prox(TV(inner=500), noisy + 5, 0.2), expected, atol=2e-3)
 
@@ -81,8 +81,8 @@ def lengths(d, epsilon=1e-3):
 
 
 def assert_least(cost, actual, bounded):
-    """A convex function's least: a general solver gets no lower from there, nor do steps at random. The first `bounded` unknowns
-    are not negative."""
+    """Require the minimum of a convex function: a general solver gets no lower from there, nor do random steps. The first
+    `bounded` unknowns are not negative."""
     bounds = [(0, None)] * bounded + [(None, None)] * (actual.size - bounded)
     lower = minimize(cost, actual.astype(float), bounds=bounds, method='L-BFGS-B', options=dict(maxfun=2500))
     assert cost(actual) < lower.fun * 1.002
@@ -193,7 +193,7 @@ def test_the_gradient_of_huber(noisy):
 
 @pytest.mark.parametrize('shifts', [False, True])
 def test_wavelets_are_a_soft_threshold(noisy, shifts):
-    """The least of the sum of squares and of absolute coefficients, by its condition on the subgradient."""
+    """The result minimises squares plus absolute coefficients, by the condition on the subgradient."""
     pywt = pytest.importorskip('pywt')
     x = np.pad(noisy, [(0, -n % 4) for n in SIZE], mode='edge') + 2  # far above zero, where there are no bounds
     prior = lm.Wavelets('db2', level=2, shifts=shifts)

@@ -66,7 +66,7 @@ def scanned(size, pixels, views, *_):
 
 
 def taken(algorithm, *sizes):
-    """The peak: what libraries and small kernels do not take, over what is expected, and all of it in bytes."""
+    """The peak without libraries and small kernels, over the expected one, and the whole peak in bytes."""
     out = subprocess.run(
         [sys.executable, '-c', PROGRAM, algorithm, *map(str, sizes)], capture_output=True, text=True, check=True
     ).stdout
@@ -86,7 +86,7 @@ def test_peak_memory_of_small_scans(algorithm):
 @pytest.mark.thorough
 def test_fdk_of_an_offset_panel():
     """It is completed by columns that no view has seen, a few views at a time. On a busy machine Dr.Jit frees later, so the
-    less of two runs counts."""
+    smaller of two runs counts."""
     assert 0.7 < min(taken('fdk', 96, 512, 100, 200)[0] for _ in range(2)) < 1.5
 
 
@@ -102,14 +102,14 @@ def test_peak_memory_of_one_kind(algorithm, sizes):
 @pytest.mark.slow
 @pytest.mark.parametrize('algorithm', ['fdk', 'sart', 'cgls', 'asd-pocs', 'refined'])
 def test_peak_memory_of_large_scans(algorithm):
-    """512^3 voxels and 100 views of 1024^2 pixels within 8 GB."""
+    """512^3 voxels and 100 views of 1024^2 pixels stay within 8 GB."""
     share, peak = taken(algorithm, 512, 1024, 100)
     assert 0.8 < share < 1.3 and peak < 8e9
 
 
 @pytest.mark.parametrize('algorithm', NEEDS)
 def test_needs_are_counted_in_float32(algorithm):
-    """4 bytes a voxel and a pixel: many voxels, or many pixels."""
+    """Voxels and pixels need 4 bytes each, in a scan of many voxels or of many pixels."""
     need, voxels, pixels = NEEDS[algorithm], 4 * 300**3, 4 * 900**2
     assert memory_needed(algorithm, scanned(300, 900, 1), 1) == pytest.approx(
         need.volumes * voxels + min(need.projections, 2) * pixels

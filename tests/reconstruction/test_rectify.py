@@ -48,7 +48,8 @@ SHORT = 'cone, yaw, 40 columns at 50.0', 'cone, all, 40 columns at 50.0', 'paral
 
 @pytest.mark.parametrize('mode, turn, columns, offset', short(MOVED, SHORT))
 def test_as_from_an_upright_panel(mode, turn, columns, offset):
-    """Centred on the axis but for some pixels, and half a panel beside it. Both volumes miss the sharp bodies by 4 to 5 %."""
+    """The panel is centred on the axis but for some pixels, or half of it is beside it. Both volumes miss the sharp bodies by 4
+    to 5 %."""
     geo, expected = upright(mode, columns, offset)
     scan = ellipsoids(moved(geo, TURNS[turn]), *BODIES)
     volume = run_algorithm(scan, FDK()).volume
@@ -76,7 +77,7 @@ def test_the_line_integrals_are_those_of_the_same_rays(mode):
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_zero_beyond_half_a_pixel_outside_the_real_panel(mode):
-    """Constant projections, which any interpolation keeps."""
+    """The projections are constant, which any interpolation keeps."""
     real = moved(geometry(mode, circular(5)), TURNS['all'])
     scan = rectified(Scan(real, np.ones((5, *real.nDetector))))
     (n_v, n_u), rays = scan.geometry.nDetector, scan.geometry.rays()

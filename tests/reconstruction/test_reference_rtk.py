@@ -28,7 +28,7 @@ BODIES = BALL, (np.array([-25.0, 20.0, -10.0]), np.array([12.0, 18.0, 15.0]), 0.
 
 
 def test_fdk_agrees_inside_the_field_of_view():
-    """An asymmetric object, a volume off the centre, voxels and counts that differ along the axes."""
+    """The object is asymmetric, the volume is off the centre, and voxels and their numbers differ along the axes."""
     geo = geometry(angles=circular(20, start=3), offDetector=(0.0, 0.0))
     scan, x = ellipsoids(geo, *BODIES), centres(geo)
     ours, theirs = run_algorithm(scan, FDK()).volume, rtk.reconstruct('FDK', scan, itk)
@@ -43,7 +43,7 @@ def residual(system, volume):
 
 
 def test_sart():
-    """Volumes and residuals pass by pass, with RTK's order of views and Joseph's transpose in both.
+    """Volumes and residuals agree pass by pass, with RTK's order of views and Joseph's transpose in both.
 
     What is left is 0.7 % of the volume and 1.7 % of the residual after the first pass. RTK divides a ray's error by its length
     in a box that ends at the outer voxels' centres, this package in one that ends at their edges.
@@ -100,8 +100,8 @@ def test_cgls_with_the_same_operators(monkeypatch, niter):
 
 @pytest.mark.parametrize('niter, tolerance', [(1, 0.001), (2, 0.01), (4, 0.02)])
 def test_cgls(niter, tolerance):
-    """Residuals; measured were 0.006, 0.6 and 1.5 %. RTK goes back by a sum over voxels, which is not the transpose, and its
-    projector weighs the voxels at the border, which the first gradient fills, in its own way."""
+    """Residuals agree; the measured differences were 0.006, 0.6 and 1.5 %. RTK goes back by a sum over voxels, which is not the
+    transpose. Its projector weighs the voxels at the border, which the first gradient fills, in its own way."""
     geo = geometry(angles=circular(20, start=3), offDetector=(0.0, 0.0))
     scan = ellipsoids(geo, *BODIES)
     ours, theirs = (

@@ -57,7 +57,7 @@ def require_same(actual, wanted):
     'algorithm', [FDK(), OSSART(niter=2, blocksize=4), ASDPOCS(niter=1, tviter=2, blocksize=5)], ids=lambda a: a.name
 )
 def test_the_volume_of_one_process(scan, tmp_path, algorithm):
-    """By the same jobs, in this process."""
+    """The same jobs run here, in this process."""
     lm.reconstruct(scan, algorithm, slab=64, out=tmp_path / 'one.ome.zarr', progress=False)
     steps = []
     run_in_slabs(scan, algorithm, tmp_path / 'many.ome.zarr', 64, lambda done, *_: steps.append(done), InProcess())
@@ -68,7 +68,7 @@ def test_the_volume_of_one_process(scan, tmp_path, algorithm):
 
 @pytest.mark.parametrize('algorithm', [FDK(), ASDPOCS(niter=1, tviter=1, blocksize=3)], ids=lambda a: a.name)
 def test_stored_views(scan, tmp_path, algorithm, monkeypatch):
-    """Read some at a time, never all, by one process and by workers; a chunk that is missing is named."""
+    """Views are read some at a time, never all, by one process and by workers; a missing chunk is named."""
     few = replace(scan, geometry=scan.geometry.on(Grid((8, 8, 80), (4.0, 3.0, 3.75))))  # two slabs
     write_scan(tmp_path / 'scan.zarr', few, 'zarr')
     stored, read = read_scan(tmp_path / 'scan.zarr').train, ZarrViews.__getitem__
@@ -172,14 +172,14 @@ def test_a_volume_of_a_fit_that_was_stopped(scan, tmp_path, monkeypatch):
 
 @pytest.fixture(scope='module')
 def client(tmp_path_factory):
-    """Of local:2, two processes that are replaced when they die."""
+    """A client of local:2, two processes that are replaced when they die."""
     with opened('local:2', tmp_path_factory.mktemp('workers'), variant=mi.variant(), bar=False) as cluster:
         yield cluster.client
 
 
 @pytest.fixture
 def workers(client):
-    """The client, whose workers are as before again after the test."""
+    """The client; after the test its workers work as before."""
     yield client
     client.run(slab_faults.undo)
 
@@ -195,7 +195,7 @@ def workers(client):
     ],
 )
 def test_a_worker_dies_in_a_slab(scan, tmp_path, workers, algorithm, at):
-    """It has written half of the slab. Another worker takes its place, and the volume is that of one process."""
+    """It has written half of the slab. Another worker takes its place, and the volume is the same as of one process."""
     run_in_slabs(scan, algorithm, tmp_path / 'one.ome.zarr', 64)
     before = set(workers.run(os.getpid).values())
     workers.run(slab_faults.die_in_slab, at, tmp_path / 'died')
@@ -287,7 +287,7 @@ def tasks_of_scheduler(dask_scheduler):
 
 @pytest.mark.thorough
 def test_a_worker_is_killed(scan, tmp_path):
-    """On real workers, one of which dies in the middle; then a fit's volume, by an open client."""
+    """One of three real workers dies in the middle. Then an open client makes a fit's volume."""
     import distributed
 
     how, out, work = OSSART(niter=6, blocksize=3), tmp_path / 'many.ome.zarr', tmp_path / 'many.ome.zarr.slabs'

@@ -37,9 +37,9 @@ def test_slabs_are_the_whole_volume(scan, tmp_path, thickness):
 
 @pytest.mark.parametrize('maxl2err', [None, 0.0, 1e9])
 def test_the_step_shrinks_as_for_the_whole(scan, tmp_path, maxl2err):
-    """A descent that changes more than the sweep, so that what decides is whether the data are matched. The gradient of total
-    variation jumps where the volume is even, which turns the slabs' rounding into 1e-5 to 1e-3; a step of another length, into
-    more than 1e-2."""
+    """The descent changes more than the sweep, so that it matters if the data are matched. The gradient of total variation
+    jumps where the volume is even: the slabs' rounding grows to 1e-5 to 1e-3, and a step of another length changes more than
+    1e-2."""
     how = ASDPOCS(niter=3, tviter=2, blocksize=5, alpha=0.5, alpha_red=0.2, rmax=0.1, maxl2err=maxl2err)
     volume = np.concatenate(list(how.slabs(scan, 6, tmp_path / 'work')), 2)
     other = ASDPOCS(**how.options | dict(maxl2err=0.0 if maxl2err == 1e9 else 1e9))
@@ -54,7 +54,8 @@ class Stop(Exception):
 
 @pytest.mark.parametrize('last', [2, 7, 14])
 def test_work_goes_on_to_the_same_bits(scan, tmp_path, last):
-    """Stopped within a sweep, a descent, and between passes: two updates and two steps a pass, of two slabs."""
+    """It is stopped within a sweep, within a descent, and between passes. A pass has two updates and two steps, of two
+    slabs."""
     how = ASDPOCS(niter=3, tviter=2, blocksize=5, alpha=0.1, rmax=0.01, maxl2err=0.0)
     whole = list(how.slabs(scan, 8, tmp_path / 'a'))
 

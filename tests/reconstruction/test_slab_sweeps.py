@@ -62,7 +62,7 @@ def test_slabs_are_the_whole_volume(scan, tmp_path, algorithm, thickness):
 
 
 def test_invalid_pixels(scan, tmp_path):
-    """The exact projector."""
+    """Slabs are the whole volume in a scan with invalid pixels, too."""
     valid = np.ones(scan.projections.shape, bool)
     valid[:, 10:20, 20:30] = False
     holed = replace(scan, valid=valid)
@@ -77,7 +77,7 @@ class Stop(Exception):
 
 @pytest.mark.parametrize('last', [1, 2, 3, 10, 12])
 def test_work_goes_on_to_the_same_bits(scan, tmp_path, last):
-    """Stopped within the first update, between two, and within the last."""
+    """It is stopped within the first update, between two, and within the last."""
     how = OSSART(niter=2, blocksize=5)
     whole = list(how.slabs(scan, 6, tmp_path / 'a'))
 
@@ -94,7 +94,7 @@ def test_work_goes_on_to_the_same_bits(scan, tmp_path, last):
 
 
 def test_the_volume_stays(scan, tmp_path):
-    """Stopped after the last update, while slabs are taken or written: nothing is computed again."""
+    """If work is stopped after the last update, while slabs are taken or written, nothing is computed again."""
     how, work = SART(niter=1), tmp_path / 'work'
     (tmp_path / 'work').mkdir()
     (work / '.lingo_mi-0123456789abcdef-state.json').touch()  # of a process that was killed while it wrote
@@ -109,7 +109,7 @@ def test_the_volume_stays(scan, tmp_path):
 
 
 def test_work_that_was_being_discarded(scan, tmp_path):
-    """Killed after the volume was written, while the files were removed: the same call begins anew."""
+    """If work was killed after the volume was written, while its files were removed, the same call begins anew."""
     how, work = SART(niter=2), tmp_path / 'work'
     whole = np.concatenate(list(how.slabs(scan, 6, work)), 2)
     for name in ('even.f32', 'odd.f32'):
@@ -118,7 +118,7 @@ def test_work_that_was_being_discarded(scan, tmp_path):
 
 
 def test_poses_in_the_middle_count(scan, tmp_path):
-    """Of 400 poses, one has moved."""
+    """One pose of 400 that has moved makes another digest."""
     rays = scan.geometry.rays()
     many = Rays(*(np.resize(part, (400, 3)) for part in (rays.source, rays.corner, rays.u, rays.v)), rays.parallel)
     moved = replace(many, source=many.source + 1e-9 * (np.arange(400) == 200)[:, None])
@@ -197,7 +197,7 @@ def test_bad_input(scan, tmp_path, monkeypatch):
 
 @pytest.mark.thorough
 def test_the_command(tmp_path):
-    """Killed by the system, it goes on."""
+    """Killed by the system, the command goes on when it is given again."""
     scene, out, work = tmp_path / 'tiny.xml', tmp_path / 'slabs.nii.gz', tmp_path / 'slabs.nii.gz.slabs'
     scene.write_text(SCENE)
     options = '--algorithm', 'sart', '-D', 'niter=15'
@@ -256,7 +256,7 @@ print(peak() - before, expected)
     ids=['slabs', 'projections', 'blocks'],
 )
 def test_peak_memory(tmp_path, sizes):
-    """`needed` predicts it, whatever the number of slices: the volume of the first takes 134 MB by itself."""
+    """`needed` predicts it, whatever the number of slices. The first case's volume alone takes 134 MB."""
     for folder in ('first', 'second'):  # the first compiles the kernels, which takes memory of its own
         command = [sys.executable, '-c', PROGRAM, str(tmp_path / folder), *map(str, sizes)]
         taken, expected = map(int, subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())

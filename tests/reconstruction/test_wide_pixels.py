@@ -52,7 +52,7 @@ def test_excess_width():
 
 @pytest.mark.parametrize('algorithm', [SART, OSSART, SIRT, ASDPOCS])
 def test_voxels_between_rays(algorithm):
-    """Rows 2.3 voxels apart at the axis leave some voxels there out: they become like those around them. Beyond the panel only
+    """Rows 2.3 voxels apart at the axis miss some voxels there, which become like those around them. Beyond the panel, only
     total variation changes anything."""
     made = phantoms.Phantom(np.ones((24, 24, 36), np.float32), (2.0, 2.0, 1.0), 'block')
     geo = default_geometry(made, circular(30), 64)
@@ -67,7 +67,7 @@ def test_voxels_between_rays(algorithm):
 
 
 def test_wide_pixels_leave_no_pattern():
-    """Pixels twice as wide as the voxels: a start with a smooth error is corrected smoothly."""
+    """Pixels are twice as wide as the voxels, and the smooth error of the start is corrected smoothly."""
     made = phantoms.make('foot', 48)
     geo = default_geometry(made, circular(12, 180.0), 24)
     assert min(excess_width(geo)) > 0.5

@@ -79,7 +79,7 @@ def test_preview_is_the_mean_of_blocks():
 
 @pytest.mark.parametrize('size', [64, pytest.param(256, marks=pytest.mark.slow)])
 def test_the_worst_volume_stays_within_the_budget(size):
-    """Noise in reconstruction and truth; the budget is in proportion to 20 MB for 256^3."""
+    """Reconstruction and truth are noise, and the budget is in proportion to 20 MB for 256^3."""
     rng = np.random.default_rng(0)
     budget, arrays = 20e6 * (size / 256) ** 3, Arrays()
     volumes = {name: rng.random((size, size, size), dtype=np.float32) for name in ('Reconstruction', 'Truth')}

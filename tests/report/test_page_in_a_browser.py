@@ -134,7 +134,7 @@ def test_a_script_that_is_not_its_own_is_refused(chromium, data, tmp_path):
 
 
 def test_values_at_the_crosshair_are_those_of_the_volume(page, data):
-    """At voxels that keys reach: to half the step that the page says its values have, and the digits that it shows."""
+    """At voxels that keys reach, they are right to half the step that the page states, and to the digits that it shows."""
     step = float(re.search(r'steps of (\S+)\. ', page.locator('#slices .note').first.text_content())[1])
     assert step < 1e-5  # of values up to 0.2
     page.focus('[data-axis="2"]')
@@ -305,7 +305,7 @@ def test_the_cloud_is_drawn_and_turned_by_keys(page):
 
 
 def test_tab_reaches_everything(page):
-    """Each button, slider, list, slice, view, chart and the scene; none twice, and each shows that it has the focus."""
+    """It reaches each button, slider, list, slice, view, chart and the scene once, and each shows that it has the focus."""
     wanted = page.evaluate(
         """() => { const all = [...document.querySelectorAll('a[href], button, input, select, summary, [tabindex="0"]')]
         .filter((e) => e.checkVisibility()); all.forEach((e, i) => { e.dataset.n = i; }); return all.length; }"""
@@ -371,7 +371,7 @@ def test_what_is_missing_is_left_out(chromium, tmp_path, changes):
 
 
 def test_a_profile_follows_the_crosshair(page, data):
-    """Along x through the crosshair: the values of the volume and of the truth, in mm."""
+    """It shows the values of the volume and of the truth along x, in mm."""
     page.evaluate('document.querySelector("canvas[data-axis=\\"2\\"]").focus()')
     press(page, 'ArrowUp', 'PageUp')
     _, y, z = at(page)

@@ -108,7 +108,7 @@ def test_extents_in_mm():
 
 
 def test_bright_block_is_drawn_at_its_place_in_mm():
-    """Read back from what imshow holds: the millimetres at which the bright pixels appear on paper."""
+    """The millimetres at which the bright pixels appear on paper are read back from what imshow holds."""
     images = drawn(figures.draw_slices, content(volume=phantom(), truth=None))
     low = np.array(CENTRE) - np.array(SHAPE) * SPACING / 2
     block = low + np.array([14.5, 9, 10.5]) * SPACING
@@ -185,7 +185,7 @@ def test_files(written):
 
 
 def test_page_needs_nothing_else(written):
-    """No address but of its own parts, and a policy that forbids all others."""
+    """It has no address except of its own parts, and a policy that forbids all others."""
     text = written[1].read_text(encoding='utf-8')
     policy, rest = text.partition('Content-Security-Policy" content="')[2].split('">', 1)
     assert policy.startswith("default-src 'none'; script-src 'sha256-") and policy.endswith("connect-src 'none'")
@@ -262,7 +262,7 @@ def test_volume_alone(tmp_path):
 
 @pytest.mark.parametrize('compared', [True, pytest.param(False, marks=pytest.mark.thorough)])
 def test_fan_beam(compared):
-    """One slice, shown large with its truth beside it, and views as lines."""
+    """The one slice is large, with its truth beside it, and views are lines."""
     shape = (20, 16, 1)
     views = np.random.default_rng(1).random((6, 1, 30))
     data = content(

@@ -75,7 +75,7 @@ def test_places_in_views_are_mm(result, tmp_path):
 
 
 def test_a_fit_that_was_not_saved(pair):
-    """It has the numbers of one that was."""
+    """It has the numbers of a saved one."""
     saved = lm.load_fit(pair[0])
     page = compare_page([('a', lm.Fit(saved.checkpoint, saved.model)), load_result(pair[1])])
     assert cells(page, 'Gaussians') == ['40', '200  (+160)'] and cells(page, 'lambda_tv') == ['0', '0.1']
@@ -83,7 +83,7 @@ def test_a_fit_that_was_not_saved(pair):
 
 
 def test_a_map_of_errors_is_that_of_its_volume(tmp_path):
-    """It does not belong to another volume that was there before."""
+    """A map of another volume that was there before is not shown."""
     volume, plan = np.random.default_rng(0).random(SHAPE).astype(np.float32), tmp_path / 'v-plan.json'
     for name in ('v', 'v-error'):
         write_volume(tmp_path / f'{name}.nii.gz', volume, Grid(SHAPE, 2.0), 'density per mm')

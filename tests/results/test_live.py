@@ -135,7 +135,7 @@ def test_a_watcher_that_fails_is_left_out(data, at, monkeypatch):
 
 
 def test_ctrl_c_passes(data):
-    """And the watchers are closed."""
+    """The watchers are closed, too."""
     closed = []
 
     class Quiet(Failing):
@@ -166,7 +166,7 @@ def test_steps_are_told_once_a_second_and_with_what_was_measured():
 
 
 def test_a_fit_that_stops_early(live):
-    """First its search, then the steps until where it stops; `gaussians` is None for a neural field."""
+    """The page shows its search, then steps out of those to the stop; `gaussians` is None for a neural field."""
     watch = Watch([live], 1000)
     step = lambda **fields: watch.step(loss=lambda: 0.5, gaussians=None, **fields)  # noqa: E731
     watch._reported = -1.0
@@ -180,7 +180,7 @@ def test_a_fit_that_stops_early(live):
 
 
 def test_a_lost_viewer_stops_nothing(data, monkeypatch):
-    """One that breaks off in the middle of an answer, again and again."""
+    """It breaks off in the middle of an answer, again and again."""
     pages = []
     monkeypatch.setattr(Live, 'announce', lambda page: pages.append(page))
 
@@ -246,7 +246,7 @@ def asked(live, seen=0, place=''):
 
 
 def test_a_page_is_told_what_it_does_not_know(live, data):
-    """New entries of the history; of the arrays those that have changed, so the truth once."""
+    """It gets new entries of the history, and the arrays that have changed, so the truth only once."""
     asked(live)
     live.step(entry(1), 100)
     live.snapshot(Drawn(data))
@@ -287,7 +287,8 @@ def test_a_history_that_is_thinned_is_told_as_a_whole(live, monkeypatch):
 
 
 def test_looking_takes_its_share_and_no_more(live, data, monkeypatch):
-    """Nothing where nobody looks; the first state at once; later ones within the share, which the first one counts in."""
+    """Nothing is made where nobody looks. The first state comes at once, and later ones within the share, in which the first
+    one counts."""
     clock = SimpleNamespace(now=live._began)
     monkeypatch.setattr('lingo_mi.results.live.time.process_time', lambda: clock.now)
     contents = live._contents
@@ -310,13 +311,13 @@ def chromium():
 
 
 def wait_for_quiet(page):
-    """Until all parts have been made and drawn."""
+    """Wait until all parts have been made and drawn."""
     page.locator('#main[aria-busy=false]').wait_for()
     page.evaluate('() => new Promise((r) => requestAnimationFrame(() => requestAnimationFrame(r)))')
 
 
 def test_a_part_that_fails_is_said_once_and_the_page_goes_on(chromium, live, data):
-    """The line and the other parts; the state is not asked for again."""
+    """The line and the other parts go on, and the state is not asked for again."""
     with opened(chromium, live.address, offline=False, first='IntersectionObserver = undefined') as page:
         for i in (1, 2, 3):
             live.step(entry(i), 3)

@@ -65,7 +65,7 @@ def test_entities(refused):
 
 @pytest.mark.parametrize('encoding', ['utf-16', 'utf-7', 'cp037', 'idna', 'no such', 'base64'])
 def test_encodings(refused, encoding):
-    """Another than Mitsuba takes it for would show another scene."""
+    """If Mitsuba took a file for another encoding, it would show another scene."""
     assert refused(f'<?xml version="1.0" encoding="{encoding}"?>' + SCENE)
 
 
@@ -109,7 +109,7 @@ def test_included_files(refused, tmp_path):
 
 
 def test_what_scenes_have(tmp_path):
-    """Long attributes, comments, other scenes: all of it is let through."""
+    """Long attributes, comments and other scenes are all let through."""
     for path in scenes().values():
         outline(path)
     (tmp_path / 'part.xml').write_text('<scene version="3.0.0"><bsdf type="diffuse" id="paint"/></scene>')

@@ -103,7 +103,7 @@ def test_the_probe_has_a_name_of_its_own(tmp_path):
 
 
 def test_the_probe_makes_nothing(tmp_path):
-    """It makes not even folders that it would remove again: two commands may begin at once."""
+    """It does not even make folders that it would remove again, because two commands may begin at once."""
     made = []
     with mock.patch.object(Path, 'mkdir', lambda *a, **k: made.append(a)):
         require_writable(tmp_path / 'a' / 'b', tmp_path)

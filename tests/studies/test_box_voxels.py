@@ -10,7 +10,7 @@ from studies.box_voxels import with_boxes
 
 
 def test_rays_through_one_voxel():
-    """Parallel rays along x: the length within the voxel, and nothing beside it, but for the edges of its pieces."""
+    """Parallel rays along x have the length within the voxel, and nothing beside it, except at the edges of its pieces."""
     volume = np.zeros((5, 5, 5), np.float32)
     volume[2, 2, 2] = 1
     geometry = lm.Geometry.parallel(nDetector=(1, 40), dDetector=0.1, nVoxel=5, dVoxel=1.0, angles=[0.0])

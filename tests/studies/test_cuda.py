@@ -71,7 +71,7 @@ def test_no_assembler(monkeypatch):
 
 
 def test_counts_of_a_profile():
-    """Instructions of warps are a block's times the warps that ran it; moves are left out."""
+    """A block's instructions count for each warp that ran it; moves are left out."""
     blocks = [dict(warps=10, lanes=200, fp32=3, move=7), dict(warps=2, lanes=64, atomic=1)]
     accesses = [dict(kind='a', sectors=5), dict(kind='l', sectors=7), dict(kind='l', sectors=1)]
     totals = _counts(dict(launches=2, threads=64, blocks=blocks, accesses=accesses))
@@ -101,7 +101,7 @@ LISTING = """      Type           Disp Enb Address            What
 
 
 def test_calls_of_a_step(monkeypatch):
-    """The differences of what gdb lists after two runs."""
+    """They are the differences of what gdb lists after two runs."""
     answers = iter(LISTING.format(hits) for hits in (9, 11))
 
     def ran(command, **_):
@@ -121,7 +121,7 @@ def test_steps_that_do_not_end(monkeypatch):
 
 
 def test_times_of_a_kernel():
-    """By hand: 64 multiprocessors at 1 GHz, 100 GB/s, lanes of an A100."""
+    """They agree with numbers by hand for 64 multiprocessors at 1 GHz, 100 GB/s, and the lanes of an A100."""
     card = Card('a card', 64, 1e9, 100e9, 80)
     times_found = times(kernel(fp32=64_000_000, fp64=1_000_000, atomics=47_360_000, loads=3_125_000), card)
     assert times_found['fp32'] == pytest.approx(64e6 * 32 / (64 * 64e9))

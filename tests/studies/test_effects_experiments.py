@@ -29,7 +29,7 @@ def test_a_wrong_scale_alone_costs_nothing_after_the_gain():
 
 @pytest.mark.thorough
 def test_an_experiment(tmp_path, monkeypatch):
-    """The blur: three fits that differ, with their table and picture, by the function and by the command."""
+    """The blur has three fits that differ, with their table and picture, by the function and by the command."""
     result = measure('psf', TINY, METHOD.changed(iterations=12))
     volumes = [result[kind]['volume'] for kind in FITS]
     assert all(v.shape == (16, 16, 16) and np.isfinite(v).all() for v in volumes)

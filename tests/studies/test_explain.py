@@ -38,7 +38,7 @@ def test_a_drift_is_what_explains_it(tmp_path):
 
 
 def test_air_that_is_read_beside_the_object_is_a_row(tmp_path):
-    """It is in the held-out views, too, and in no earlier row."""
+    """It is subtracted from held-out views, too, and not in an earlier row."""
     sound, air = fan(24), np.float32(0.1)
     dataset = lm.Dataset(*(lm.Scan(s.geometry, s.projections + air) for s in (sound.train, sound.test)))
     calibration = lm.calibrate(dataset, progress=False)

@@ -143,7 +143,7 @@ def test_table():
 
 
 def test_table_of_two_variants(tmp_path):
-    """Worst derivatives in one column; a miss, another note and a case that is not there are told in the remark."""
+    """Worst derivatives share a column; the remark tells of a miss, of another note, and of an absent case."""
     case = next(case for case in CASES if case.name == 'density 1e-12, cone')
     fit = ScanCase('a fit', lambda: None, note='30 steps')
     absent = ScanCase('absent', lambda: None)
@@ -179,7 +179,7 @@ def test_committed_results_miss_nothing():
 
 
 def test_command(tmp_path, monkeypatch):
-    """The page and how it was made; the exit code and a line for each case that misses its tolerance."""
+    """It writes the page and how it was made. The exit code and a line tell of each case that misses its tolerance."""
     good = next(case for case in CASES if case.name == 'density 0, cone')
     cases = [good, replace(good, name='too good', warned=True)]
     monkeypatch.setattr('studies.hard_cases.cases.all_cases', lambda steps: cases[:1])
@@ -239,7 +239,7 @@ def test_models_that_do_not_reach_a_gaussian_at_the_source(model):
 
 @pytest.mark.parametrize('side, sigma', [(33, 1.0), (513, 0.1)])
 def test_a_pile_of_gaussians_is_summed_as_accurately_as_one(side, sigma):
-    """However small, and wherever in the order of the cloud."""
+    """This holds however small they are, and wherever they are in the order of the cloud."""
     count = 20_000
     frames, shape = scanner(shape=(side, side), size=(3.2, 3.2))
     one = Cloud([[0, 0, 0]], [[sigma * 3.2 / side / 1.5] * 3], [[0.1, 0.2, 0.3, 0.9]], [0.7])
@@ -276,8 +276,8 @@ def vectors(low, high, size):
 
 @st.composite
 def clouds(draw):
-    """One to four Gaussians in and around [-1, 1]^3, scales from 1e-4 to 2, aspects up to 2e4, densities of either sign;
-    or the first of them, as often."""
+    """One to four Gaussians in and around [-1, 1]^3, scales from 1e-4 to 2, aspects up to 2e4, densities of either sign; or as
+    many copies of the first."""
     n = draw(st.integers(1, 4))
     rows = [
         (
@@ -424,7 +424,7 @@ def raw_state(scale=0.0, density=0.0, rotation=(0, 0, 0, 1)):
 
 @pytest.mark.parametrize('raw', [-1e30, -1e4, -90, -20, 0, 20, 90, 1e4, 1e30])
 def test_activations_at_both_ends(raw):
-    """Finite values within their bounds and finite derivatives, the same on the host and on the device."""
+    """Values are finite and within their bounds, and derivatives finite, the same on the host and on the device."""
     state = raw_state(scale=raw, density=raw)
     with np.errstate(over='ignore'):
         _, scale, _, density = activate(state, FORWARD)

@@ -55,7 +55,7 @@ def test_a_small_table(monkeypatch, capsys, tmp_path):
 
 
 def test_the_measured_walnut(data, tmp_path):
-    """On the voxels asked for, which are as large as all together need; its truth is the FDK of all views."""
+    """It has the voxels asked for, as large as all together need; its truth is the FDK of all views."""
     dataset = Study(tmp_path, 8).dataset(Case('walnut', views=30))
     geometry = dataset.train.geometry
     assert tuple(geometry.grid.shape) == (8, 8, 8) and len(dataset.train) == 30

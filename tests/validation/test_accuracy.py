@@ -99,7 +99,7 @@ def test_closed_form_is_the_oracle(mode):
 
 
 def test_pixel_mean_of_the_truth(cone):
-    """Gauss-Legendre points against 12 x 12 rays a pixel."""
+    """Gauss-Legendre points agree with 12 x 12 rays a pixel."""
     columns, frames = [x[:5] for x in cone.columns], cone.geometry.rays()
     mean, _ = image_and_gradients(columns, frames, (96, 96), order=4)
     fine = replace(frames, u=frames.u / 12, v=frames.v / 12)
@@ -125,7 +125,7 @@ def test_affine_is_exact_in_parallel_beams(parallel):
 
 
 def test_affine_adds_no_kernel(cone):
-    """The same kernels, so that neither model pays for the other."""
+    """Both models run the same kernels, so that neither pays for the other."""
 
     def kernels(footprint):
         render(cone, footprint=footprint)
@@ -162,7 +162,8 @@ def test_pixel_gradients(variant):
 
 @pytest.mark.parametrize('mode', ['cone', pytest.param('parallel', marks=pytest.mark.thorough)])
 def test_pixel_area(variant, mode):
-    """Better than 4 x 4 rays where the Gaussians are wider than a pixel, and nearly by the fourth power of its size."""
+    """It is better than 4 x 4 rays if the Gaussians are wider than a pixel, and its error falls nearly with the fourth power of
+    the size."""
     coarse, fine = (Workload(60, 64 * k, 80.0 * k**2, order=6, mode=mode) for k in (1, 2))
     actual, rays = errors(fine, extent=8.0, pixel='area'), errors(fine, extent=8.0, pixel=4)
     assert all(actual[name] < 0.8 * rays[name] for name in actual)
@@ -170,7 +171,8 @@ def test_pixel_area(variant, mode):
 
 
 def test_pixel_area_of_a_pixel_wide_ridge(variant):
-    """A Gaussian far longer than wide, along the rows: its profile across is the box's convolution, exactly known."""
+    """The Gaussian is far longer than wide, along the rows. Its profile across is the box's convolution, which is exactly
+    known."""
     from scipy.special import erf
 
     sigma, step = 0.05, 0.1  # one pixel of the plane through the centre, two at the panel
@@ -290,7 +292,7 @@ def test_every_gaussian_on_every_ray(beam, precision, limit, request):
 
 
 def test_march_of_a_constant():
-    """Chords of a cube, up to a step at its ends."""
+    """It gives the chords of a cube, up to a step at its ends."""
     data = dr.ones(mi.Float, 8**3)
     dr.make_opaque(data)
     origin, direction = mi.Point3f([-3, -3], [0, 0], [0, 0.4]), mi.Vector3f([1, 1], [0, 0.1], [0, 0])
@@ -350,7 +352,7 @@ def test_presets_are_described_as_measured(variant):
 
 @pytest.mark.thorough
 def test_presets_of_two_variants(tmp_path, monkeypatch):
-    """The presets alone, by the command: their table with another run's errors replaces the document's table."""
+    """The command measures the presets alone. Their table, with another run's errors, replaces the document's table."""
     actual = measure_presets(TINY)
     other = json.loads(json.dumps(actual))
     other['conditions']['variant'] = 'cuda_ad_mono'
@@ -374,7 +376,7 @@ def test_presets_of_two_variants(tmp_path, monkeypatch):
 @pytest.mark.thorough
 @pytest.mark.traces_rays
 def test_whole_measurement(tmp_path, monkeypatch):
-    """Every part on a tiny configuration, down to the documentation, by the function and by the command."""
+    """Every part runs on a tiny configuration, down to the documentation, by the function and by the command."""
     parts = []
     actual = measure(TINY, parts.append)
     assert len(parts) == len(actual) - 1

@@ -255,7 +255,7 @@ def _stop_at(iteration):
 @pytest.mark.posix
 @pytest.mark.thorough
 def test_killed(tmp_path):
-    """`kill -9` in the middle of the second cell: the first stays, and the same command ends the table."""
+    """After `kill -9` in the middle of the second cell the first one stays, and the same command ends the table."""
     arguments = '--views', '4', '5', '--methods', 'r2', '--iterations', '20'
     code = (
         'import runpy, sys\nimport lingo_mi\nfrom lingo_mi.common.runtime import use_variant\n'
@@ -334,7 +334,7 @@ def test_gains_of_rows_are_over_the_first():
 
 @pytest.fixture(scope='module')
 def theirs(tmp_path_factory):
-    """A folder with a pickle as SAX-NeRF's and a folder as R2-Gaussian's."""
+    """A folder with a pickle like SAX-NeRF's and a folder like R2-Gaussian's."""
     folder = tmp_path_factory.mktemp('x3d')
     with mock.patch.object(tables, 'SCANNED', 6):
         data = Cells(folder, Scale(16, 24, 200, (20,), ('foot',))).dataset('foot')

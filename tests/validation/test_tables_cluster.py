@@ -1,4 +1,4 @@
-"""The cells of the paper's tables on three workers, of which one is killed: the same numbers as from undisturbed workers."""
+"""The cells of the paper's tables on three workers, one of them killed: the same numbers as from undisturbed workers."""
 
 import json
 import os
@@ -84,7 +84,7 @@ def test_a_worker_is_killed(tmp_path):
 
 @pytest.mark.thorough
 def test_a_series_that_fails(tmp_path):
-    """Another process has the folder of one series: the other cells are computed, and the line says which one failed."""
+    """If another process has the folder of one series, the other cells are computed, and the line says which one failed."""
     cells, fit = Cells(tmp_path / 'out', TINY), Fit('foot', 4, 'none')
     with locked(cells.folder_of(fit)), cluster(tmp_path, workers=1) as (address, _):
         code, text, err = tables(tmp_path / 'out', '--cluster', address, '--iterations', 5)

@@ -98,7 +98,7 @@ def test_the_light_is_a_constant_to_the_derivatives():
 
 @pytest.mark.traces_rays
 def test_when_it_is_estimated(monkeypatch):
-    """A handful of times, at once for all views."""
+    """The light is estimated a handful of times, at once for all views."""
     scan = replace(tiny_scan(geometry(3)), effects=effects_of())
     seen, steppers, estimate = [], [], ScatteredLight.estimate
 
@@ -136,7 +136,7 @@ def test_a_fit_with_scatter_is_not_made_longer(tmp_path):
 
 @pytest.mark.traces_rays
 def test_resumed_fit_is_the_same_fit(tmp_path, variant):
-    """Also between two estimates."""
+    """A fit may stop between two estimates, too."""
     scan = tiny_scan(geometry(3))
     scan = replace(scan, projections=scan.projections / 50, effects=effects_of())
     whole, path = run(scan, SHORT, seed=3), tmp_path / 'fit.npz'

@@ -80,7 +80,7 @@ def test_motions_of_all_views_are_the_objects():
 
 
 def recovered(views, iterations, points):
-    """A fit with the given poses and one that corrects them: errors of the poses before and after, of the views."""
+    """Errors of the poses before and after a correction, errors of the views without and with it, and the two fits."""
     g = geometry(views, angles=circular(views, 360, start=10))
     true, turn, shift = misaligned(g)
     scan = Scan(g, tiny_scan(true).projections)

@@ -51,7 +51,8 @@ def rms(x):
     ],
 )
 def test_what_the_detector_did_is_found(values, changes, within, better):
-    """From 8 views in 600 steps: air of 0.05 to 0.01, gains of 4 % to 1 %, root mean square. The line integrals are better, too.
+    """Eight views and 600 steps give an air level of 0.05 to 0.01 and gains of 4 % to 1 %, rms. The line integrals are better,
+    too.
 
     With five seeds, the root mean square of the gains' errors was 0.3 to 0.7 %, and the largest error 0.6 to 1.9 %.
     """
@@ -70,7 +71,7 @@ ALL = dict(fit_air='view', fit_gain='smooth', fit_pixels='one')
 
 
 def test_offsets_of_pixels_are_found():
-    """Gains of 20 % that the flats missed, in 8 views: most of each offset is found, and the line integrals are better."""
+    """If the flats missed gains of 20 %, 8 views give most of each pixel's offset, and better line integrals."""
     ideal = true_views()
     offsets = np.random.default_rng(0).normal(0, 0.2, ideal.geometry.nDetector).astype(np.float32)
     scan = Scan(ideal.geometry, ideal.projections + offsets)
@@ -84,7 +85,7 @@ def test_offsets_of_pixels_are_found():
 
 @pytest.mark.parametrize(('misfit', 'left'), [(0.005, 0.25), (0.1, 1.0)])
 def test_offsets_as_sure_as_the_object(misfit, left):
-    """Most of each pixel's offset is found of an object that is known, and nothing is lost by one that is not."""
+    """If the object is known, most of each pixel's offset is found; if it is not, nothing is lost."""
     ideal, rng = true_views(), np.random.default_rng(0)
     offsets = rng.normal(0, 0.05, ideal.geometry.nDetector)
     expected = ideal.projections + rng.normal(0, misfit, ideal.projections.shape).astype(np.float32)
@@ -118,7 +119,7 @@ def test_checkpoints_keep_the_response(tmp_path, sums_in_order):
 
 
 def test_dead_columns():
-    """Every other one: binned by two, no pixel of such a scan would be valid."""
+    """Every other column is dead: binned by two, no pixel of such a scan would be valid."""
     scan, _ = measured(true_views(4), air=[[0.05], [0.03]])
     valid = np.ones(scan.projections.shape, bool)
     valid[..., ::2] = False
@@ -160,7 +161,7 @@ def test_steps_are_the_same_kernels_with_and_without():
 
 @pytest.mark.thorough
 def test_smooth_poses_hold_and_are_told_of_views_between():
-    """A drift of the panel of 1.6 pixels: most of it is found, and views between get theirs."""
+    """Most of a drift of the panel of 1.6 pixels is found, and views in between get theirs."""
     g = geometry(16, angles=circular(16, 360, start=10))
     pixel = g.dDetector[1]
     drift = Drift.of(g, dict(u1=0.8 * pixel))
@@ -190,7 +191,7 @@ def test_bad_options(changes, message):
 
 
 def test_volumes_from_a_result_are_made_without_the_response(tmp_path, no_report):
-    """Measured views are as the cloud's own: in Python, from the files of the result, and beside completed views."""
+    """The response is undone in measured views: in Python, from the files of the result, and beside completed views."""
     scan, true = measured(true_views(8), air=[[0.05], [0.03]], gain=[[0], [0.06]])
     method = SHORT.changed(iterations=20, fit_air='smooth', fit_gain='smooth')
     fitted = run(scan, method, seed=3)

@@ -28,7 +28,8 @@ def rendered(method, g, state=None, unit=1.0):
 
 @pytest.mark.parametrize('changes', BOXES)
 def test_integrals_are_those_of_the_sampled_field(changes):
-    """The exact projector of the field on fine voxels; what is left is their error, which the samples do not have."""
+    """They agree with the exact projector of the field on fine voxels, up to the voxels' error, which the samples do not
+    have."""
     g = views(**changes)
     state = random_state(SMOOTH, amplitude=3)
     fine = g.on(g.grid.finer(3))
@@ -39,7 +40,7 @@ def test_integrals_are_those_of_the_sampled_field(changes):
 
 
 def test_error_falls_with_the_number_of_samples():
-    """To a quarter with twice the samples, as the midpoint rule's on smooth functions; the cells' faces cost a little."""
+    """Twice the samples quarter it, as in the midpoint rule on smooth functions; the cells' faces cost a little."""
     g, state = views(), random_state(SMOOTH, amplitude=3)
     expected = rendered(SMOOTH.changed(field_samples=1536), g, state)
     errors = [

@@ -36,13 +36,13 @@ def test_density_is_that_of_a_reference_in_float64(method, points):
 
 
 def test_published_size():
-    """16 levels with 2 features, the three coarsest stored whole, and a network of 4225 numbers."""
+    """The field has 16 levels with 2 features, the three coarsest stored whole, and a network of 4225 numbers."""
     shapes = Network(NAF().field).shapes
     assert shapes == {'features': (2 * (16**3 + 32**3 + 64**3 + 13 * 2**19), 1), 'network': (4225, 1)}
 
 
 def test_derivatives_are_those_of_a_reference_and_of_differences(method, points):
-    """The derivative along a random direction, by central differences in float64, and all derivatives one by one."""
+    """All agree with the reference, one by one; along a random direction, they agree with central differences in float64."""
     state, weights = random_state(method), np.random.default_rng(2).normal(size=len(points)).astype(np.float32)
     values = DeviceState(state).values
     for value in values.values():

@@ -78,7 +78,7 @@ def as_stored(method):
 
 
 def test_rates_of_naf_fall_to_a_tenth():
-    """From 1e-3, as published."""
+    """They start from 1e-3, as published."""
     for name in ('features', 'network'):
         assert method_of('naf').flat()[f'rate_{name}'] == (1e-3, 1e-4)
 
@@ -125,7 +125,7 @@ class Outsider(lm.DensityMethod):
 
 @dataclass(frozen=True)
 class Nameless(lm.DensityMethod):
-    """A base of methods, which is none."""
+    """A base of methods, which is not a method itself."""
 
 
 def test_abstract_classes_are_no_methods():

@@ -24,7 +24,7 @@ from lingo_mi.reconstruction.run import run_algorithm
 
 @pytest.fixture
 def one_thread(sums_in_order):
-    """Sums of derivatives take the order in which threads come to their parts."""
+    """Run in one thread, since sums of derivatives depend on the order in which threads take their parts."""
     before = dr.thread_count()
     use_threads(1)
     yield
@@ -57,7 +57,7 @@ def test_it_learns_the_object(learnt):
 
 @pytest.mark.parametrize('factor', [pytest.param(0.02, marks=pytest.mark.thorough), 50])
 def test_it_learns_densities_of_any_unit(factor, learnt):
-    """Densities are those of matter, about 0.02 per mm, or beyond 1, which the published form cannot reach."""
+    """Densities may be as in matter, about 0.02 per mm, or beyond 1, which the published form cannot reach."""
     scan, fitted = learnt
     scaled = replace(scan, projections=scan.projections * np.float32(factor))
     refitted = fit(scaled, fitted.method.changed(iterations=150))
@@ -73,14 +73,14 @@ def test_the_published_start_is_half_the_largest_density(scan):
 
 @pytest.mark.thorough
 def test_from_half_the_largest_density_the_field_is_lost_at_first(learnt):
-    """It falls to 0, where the sigmoid has no slope; from the scan's mean, as many steps suffice."""
+    """The field falls to 0, where the sigmoid has no slope. From the scan's mean, as many steps suffice."""
     scan, fitted = learnt
     refitted = fit(scan, fitted.method.changed(field_start='random'))
     assert error_of(refitted, scan) > 5 * error_of(fitted, scan)
 
 
 def test_unit_and_start_follow_the_scan(scan):
-    """A bound of the densities, and their mean along the rays."""
+    """The unit is a bound of the densities, and the field starts from their mean along the rays."""
     stepper = SMALL.stepper(scan)
     truth = tiny_scan_volume(scan)
     assert truth.max() < stepper.model.unit < 4 * truth.max()

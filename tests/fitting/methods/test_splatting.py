@@ -38,7 +38,7 @@ SHORT = dict(
 
 
 def short(name):
-    """A fit of 40 steps, with rates that get somewhere in as many."""
+    """A method of 40 steps, with rates that get somewhere in so few."""
     points = dict(n_points=100) if name == '3dgs' else {}
     return METHODS[name].changed(**SHORT, **points, rate_opacity=(5e-2, 5e-2), rate_radiance=(2e-2, 2e-2))
 
@@ -77,7 +77,7 @@ def basis(directions, mode='cone'):
 
 @pytest.mark.parametrize('mode', ['cone', 'parallel'])
 def test_harmonics_of_degree_0_and_1(mode):
-    """3DGS's order and signs: (-y, z, -x)."""
+    """They have 3DGS's order and signs: (-y, z, -x)."""
     d = np.array([0.36, -0.48, 0.8])
     c = np.sqrt(3 / (4 * np.pi))
     expected = [1 / np.sqrt(4 * np.pi), -c * d[1], c * d[2], -c * d[0]]
@@ -195,7 +195,7 @@ def test_the_fit_descends(scan, whole):
 
 @pytest.mark.parametrize('stop', [14, pytest.param(15, marks=pytest.mark.thorough), 33])
 def test_resumed_fit_is_the_same_fit(scan, whole, tmp_path, stop, variant):
-    """Stopped before a reset of the opacities, right after it, and after the densification."""
+    """It is stopped before a reset of the opacities, right after it, or after the densification."""
     method, fitted = whole
     path = tmp_path / 'fit.npz'
     with pytest.raises(KeyboardInterrupt):
@@ -208,7 +208,7 @@ def test_resumed_fit_is_the_same_fit(scan, whole, tmp_path, stop, variant):
 
 
 def test_the_method_stays_as_it_was_given(scan, whole):
-    """In units of the radius: the method of a fit makes the same fit again."""
+    """Its lengths stay in units of the radius, so the method of a fit makes the same fit again."""
     method, fitted = whole
     for name in ('rate_centre', 'split_size', 'prune_size'):
         assert fitted.method.flat()[name] == method.flat()[name]
@@ -247,14 +247,14 @@ def test_no_kernel_is_compiled_after_the_first_steps():
 
 
 def test_it_may_start_where_other_methods_do(scan):
-    """From points with densities, which do not count."""
+    """It may start from points with densities, which do not count."""
     fitted = run(scan, short('3dgs').changed(start='edges', n_points=80, iterations=10))
     assert len(fitted.checkpoint.arrays['initial']) == 80 and fitted.info['method'] == 'edges'
     assert fitted.history[-1]['loss'] < fitted.history[0]['loss']
 
 
 def test_fan_beam():
-    """One row and one slice: nothing leaves the plane."""
+    """With one row and one slice, nothing leaves the plane."""
     scan = tiny_scan(geometry(3, nDetector=(1, 48), dDetector=(8.0, 8.0), nVoxel=(32, 32, 1)), flat=True)
     method = short('xgaussian').changed(iterations=20, cuboid_step=4)
     fitted = run(scan, method)
@@ -412,7 +412,7 @@ def test_bad_combination_on_the_command_line(scene, tmp_path):
 
 
 def test_a_radiance_without_directions_as_a_harmonic():
-    """1/2 plus the coefficient times the harmonic of degree 0, 1 / (2 sqrt(pi))."""
+    """It is 1/2 plus the coefficient times the harmonic of degree 0, 1 / (2 sqrt(pi))."""
     raw = np.array([[-3.0], [0.0], [2.0]])
     degree0, more = harmonics({'radiance': raw})
     np.testing.assert_allclose(0.5 + 0.28209479177387814 * degree0, 1 / (1 + np.exp(-raw[:, 0])), rtol=1e-12)

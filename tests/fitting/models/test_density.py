@@ -29,7 +29,7 @@ def test_images_do_not_depend_on_the_voxels_of_a_geometry(fitted):
 
 
 def test_images_do_not_depend_on_where_the_panel_stands(fitted):
-    """Through the middle of the volume, or behind it with the same rays."""
+    """It stands in the middle of the volume, or behind it with the same rays."""
     g = fitted.geometry
     middle = replace(g, DSD=g.DSO, dDetector=tuple(d * g.DSO / g.DSD for d in g.dDetector))
     expected = fitted.render(g)
@@ -44,7 +44,7 @@ def test_progress_counts_the_views(fitted):
 
 
 def test_the_volume_on_another_grid(fitted):
-    """Smaller voxels in a part of the volume, beside its centre: the densities of the cloud at these places."""
+    """Smaller voxels in a part of the volume, off its centre, hold the cloud's densities at these places."""
     g = fitted.geometry
     part = Grid((6, 5, 4), tuple(0.4 * d for d in g.grid.spacing), (3.0, -2.0, 1.0))
     volume = fitted.volume(part)

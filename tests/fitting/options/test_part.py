@@ -194,7 +194,7 @@ def test_method_of():
 
 @pytest.mark.parametrize('method', METHODS)
 def test_flat_names(method):
-    """Every value has one, no two share one, and they are all that a method is."""
+    """Every value has one, no two share one, and together they are the whole method."""
     method_class = METHODS[method]
     flat, parts = method_class.flat(), parts_of(method_class)
     named = [part for part in parts if part.name]
@@ -256,7 +256,7 @@ def test_limits(name, within, beyond):
     ],
 )
 def test_another_start_keeps_what_both_share(before, changes, after):
-    """Their options, but for those that are as usual: then they are as usual in the other start."""
+    """Shared options that were changed stay; the others take the other start's defaults."""
     changed = before.changed(**changes)
     assert changed.start == after and type(changed.start) is type(after)
     assert {k: v for k, v in vars(changed).items() if k != 'start'} == {

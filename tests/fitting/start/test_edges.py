@@ -75,7 +75,7 @@ def test_a_large_volume_is_thinned_with_its_pixels(ball, monkeypatch):
 
 
 def test_pixels_that_are_not_valid_are_not_binned(ball, monkeypatch):
-    """One in four, in every block: binned, none were left."""
+    """One in four is invalid in every block, so that binning would leave none."""
     monkeypatch.setattr(edges, 'LARGEST', 20)
     valid = np.ones(ball.projections.shape, bool)
     valid[:, ::2, ::2] = False

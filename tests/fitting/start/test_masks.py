@@ -29,7 +29,7 @@ def test_draw_repeats_only_when_it_must_and_evenly():
 
 
 def test_points_stay_within_a_flat_volume():
-    """Half as wide and a quarter as high as deep: each point in its cell."""
+    """In a volume half as wide and a quarter as high as deep, each point stays in its cell."""
     geometry, _, projections = sphere_scan(0.2, centre=(0, 0, 0), nVoxel=(24, 48, 12))
     cloud = PAPER.from_views(Scan(geometry, projections), np.random.default_rng(1))
     assert cloud.info['repeats'] > 200
@@ -108,7 +108,7 @@ def test_density_modes(monkeypatch):
 
 
 def test_densities_of_an_fdk_volume():
-    """A volume that is a plane along each axis is its own interpolation; what is faint counts as a little."""
+    """A volume that is linear along each axis is its own interpolation; faint densities are raised to a lower bound."""
     geometry, frames, projections = sphere_scan()
     slope = np.array([0.3, 0.2, 0.1])
     axes = [(2 * np.arange(n) + 1) / n - 1 for n in geometry.grid.shape]  # times `half`: the voxels' centres
