@@ -22,7 +22,7 @@ from lingo_mi.common.runtime import calm_openmp, find_libllvm, restart_llvm
 
 calm_openmp()  # before anything loads PyTorch
 find_libllvm()  # before anything loads Dr.Jit
-restart_llvm()  # or after it
+restart_llvm()  # or anew, if something has loaded it
 
 from lingo_mi.plugins import watch_variants  # noqa: E402 - loads Mitsuba, and Dr.Jit with it
 
@@ -30,7 +30,7 @@ watch_variants()
 
 __version__ = '0.2.0.dev0'
 
-if TYPE_CHECKING:  # editors read these in the place of the table below
+if TYPE_CHECKING:  # editors read these in place of the table below
     from lingo_mi.api.calibration import calibrate
     from lingo_mi.api.data import load, load_raw, phantom, simulate
     from lingo_mi.api.estimate import Estimate, estimate

@@ -89,7 +89,7 @@ class Scan:
 
     if not TYPE_CHECKING:
 
-        def __getattr__(self, name):  # of what is missing: the projections of stored views, before they are read
+        def __getattr__(self, name):  # missing attributes: the projections of stored views, before they are read
             if name != 'projections' or self.__dict__.get('stored') is None:
                 raise AttributeError(f'{type(self).__name__!r} object has no attribute {name!r}')
             object.__setattr__(self, 'projections', self.stored[:])

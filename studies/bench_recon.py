@@ -43,7 +43,7 @@ def arguments() -> argparse.Namespace:
         type=float,
         default=0.0,
         metavar='DEGREES',
-        help="of the axis of rotation against the volume's (default: 0)",
+        help="angle of the axis of rotation to the volume's (default: 0)",
     )
     p.add_argument('--json', type=Path, metavar='F', help='write the numbers there')
     p.add_argument(

@@ -25,13 +25,15 @@ def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--stand-in', required=True, metavar='PROGRAM', help='runs a command with a stand-in for the driver')
     p.add_argument(
-        '--tests', type=Path, default=Path('tests'), metavar='FOLDER', help='of the checkout (default: tests)'
+        '--tests', type=Path, default=Path('tests'), metavar='FOLDER', help='tests of the checkout (default: tests)'
     )
     p.add_argument(
         '--share', action='store_true', help='few tests of every part that computes on the device: some minutes'
     )
     p.add_argument('--sm', type=int, nargs='+', default=[75, 80, 90], help='compute capabilities times ten')
-    p.add_argument('--noise', action='store_true', help='the first --sm with the errors that NVIDIA allows, and checks')
+    p.add_argument(
+        '--noise', action='store_true', help='run the first --sm with the errors that NVIDIA allows, and checks'
+    )
     p.add_argument('--out', type=Path, metavar='DIR', help='keep what has passed there, and go on from it')
     p.add_argument('--markdown', type=Path, metavar='F', help='write the page there, too')
     args = p.parse_args()

@@ -146,7 +146,7 @@ def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--out', type=Path, default=Path('out/on_a_gpu'), metavar='DIR', help='(default: out/on_a_gpu)')
     p.add_argument('--stand-in', metavar='PROGRAM', help='rehearse under a stand-in for the CUDA driver')
-    p.add_argument('--parts', nargs='+', metavar='NAME', help='only these (default: all)')
+    p.add_argument('--parts', nargs='+', metavar='NAME', help='parts to run (default: all)')
     args = p.parse_args()
     if args.stand_in and shutil.which(args.stand_in) is None:
         raise InputError(f'--stand-in {args.stand_in}: is not a program that can be run')

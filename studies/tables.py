@@ -51,10 +51,14 @@ def arguments() -> argparse.Namespace:
         type=float,
         default=0.0,
         metavar='N',
-        help='a pixel in the open beam, of fitted views (default: no noise)',
+        help='photons a pixel in the open beam, for the fitted views (default: no noise)',
     )
     p.add_argument(
-        '--electronic-noise', type=float, default=0.0, metavar='S', help='standard deviation, in photons (default: 0)'
+        '--electronic-noise',
+        type=float,
+        default=0.0,
+        metavar='S',
+        help='its standard deviation, in photons (default: 0)',
     )
     p.add_argument(
         '--longest',

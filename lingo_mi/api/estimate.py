@@ -25,7 +25,7 @@ from lingo_mi.scan import Dataset, Scan
 from lingo_mi.scene.checks import least_memory
 
 EQUAL, CHANGING = (0.7, 1.5), (0.3, 4.0)  # time of future steps over the time of as many trial steps
-LEAST_STEPS = 3  # of a trial: the first compiles kernels, and does not count
+LEAST_STEPS = 3  # steps of a trial: the first compiles kernels, and does not count
 
 
 @dataclass(frozen=True)

@@ -155,7 +155,8 @@ def reconstruct(
         require_whole_chunks(path, slab, unit)
     if slab is None:  # else the slabs are checked
         seen = views or (len(start.nominal_geometry) if isinstance(start, Fit) else None)
-        both = 0 if truth is None or start is None else 4 * prod(scan.geometry.grid.shape)  # the needs have one of them
+        # The needs count only one of these two volumes.
+        both = 0 if truth is None or start is None else 4 * prod(scan.geometry.grid.shape)
         check_room(scan.geometry, algorithm, seen, mask_images(scan) + both)
     with nullcontext() if path is None else writing_file(path):
         scan, algorithm, inputs = _prepared(scan, algorithm, start, views)

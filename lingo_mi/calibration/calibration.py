@@ -111,7 +111,7 @@ class Calibration:
         if self.air is not None:
             scan = without_air(line_integrals(scan))
         if response is not None:
-            scan = line_integrals(scan)  # which the response was fitted to
+            scan = line_integrals(scan)  # the response was fitted to these
             scan = replace(scan, projections=response.undone(scan.projections, scan.geometry))
         return replace(scan, geometry=self.found.drift.panel(scan.geometry).moved(scan.geometry))
 

@@ -13,12 +13,12 @@ from lingo_mi.reconstruction.sart import blocks, sweep
 from lingo_mi.reconstruction.system import System
 from lingo_mi.scan import Scan
 
-PASSES = 4  # over the views: fewer leave edges and peaks too low, which a curve of the detector would seem to explain
+PASSES = 4  # over the views: fewer leave edges and peaks too low, as if the detector had a curve
 RELAXATION = 1.0
-SMOOTH = 0.8  # pixels, standard deviation: leaves nothing that a shift by part of a pixel would smooth further
+SMOOTH = 0.8  # standard deviation in pixels: so smooth that a shift by part of a pixel smooths no further
 BEYOND = 4  # pixels of a row or a column that smoothing adds to either end
-EDGE = 0.15  # of the highest value: an object there goes on beyond the panel
-WIDER, MARGIN = 1.5, 1.15  # how much larger the volume then is, and otherwise: a panel that moves, moves the object
+EDGE = 0.15  # of the highest value: if the panel's edge has more, the object goes on beyond it
+WIDER, MARGIN = 1.5, 1.15  # factors on the volume then, and otherwise: a panel that moves, moves the object
 
 
 def coarse(scan: Scan, pixels: int) -> Scan:

@@ -10,7 +10,7 @@ from numpy.polynomial import legendre
 from lingo_mi.calibration.panel import Panel
 from lingo_mi.geometry.base import Geometry
 
-NEAR = 1e-6  # radians that are none
+NEAR = 1e-6  # radians that count as zero
 
 
 def scan_times(geometry: Geometry, angles: np.ndarray) -> np.ndarray:
@@ -29,9 +29,9 @@ def scan_times(geometry: Geometry, angles: np.ndarray) -> np.ndarray:
     if n < 2 or not _in_order(scan_angles):
         return np.linspace(-1, 1, len(angles)) if len(angles) > 1 else np.zeros(len(angles))
     turned, x = np.abs(scan_angles - scan_angles[0]), np.sign(turns[0]) * (angles - scan_angles[0])
-    if turned[-1] < 2 * np.pi:  # a view whose angle is none between them came after the last
+    if turned[-1] < 2 * np.pi:  # a view at an angle outside theirs came after the last
         x = np.mod(x + NEAR, 2 * np.pi) - NEAR
-    elif x.min() < -NEAR or np.ptp(geometry.angles) < 2 * np.pi:  # angles that do not count the turns
+    elif x.min() < -NEAR or np.ptp(geometry.angles) < 2 * np.pi:  # these angles do not count the turns
         x = _counted(np.mod(x + NEAR, 2 * np.pi) - NEAR)
     step = 2 / (n - 1)
     ends = np.append(turned, turned[-1] + np.median(np.abs(turns)))

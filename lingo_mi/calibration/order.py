@@ -21,10 +21,10 @@ from lingo_mi.reconstruction.preconditions import require_rays, require_signal
 from lingo_mi.scan import Scan
 
 PIXELS, MOST_VIEWS, LEAST_VIEWS = 32, 60, 20
-WORSE = 1.8  # times the differences, which a random order makes at least
-REVERSED = 0.9  # times the differences, below which the opposite sense is the right one
-ROUND = 0.05  # of the views: with smaller differences than that the object looks alike from everywhere
-ODD = 5.0  # times the median difference, of all views and of its neighbours, which a view out of place has
+WORSE = 1.8  # least factor by which a random order makes the differences larger
+REVERSED = 0.9  # if the opposite sense makes the differences smaller than this part, it is right
+ROUND = 0.05  # part of the views' signal: with smaller differences, the object looks alike from everywhere
+ODD = 5.0  # a view out of place differs so many times as much as the median of all, and of its neighbours
 NEIGHBOURS = 5  # views, in the order of the scan
 
 

@@ -34,14 +34,14 @@ from lingo_mi.scan import Scan
 
 FIRST, FINE = 32, (32, 48)  # columns of the binned panel: for trials, and for one step each
 MOST_VIEWS = 60
-REACH, FARTHEST = 0.06, 0.5  # of the panel's width: how far off an axis is looked for at first, and at most
-TRIAL = 0.6 / FIRST  # of the panel's width: between trials
-CLEAR = 0.5  # of the largest sum of squares among the trials: a smallest one above it is not a minimum
+REACH, FARTHEST = 0.06, 0.5  # parts of the panel's width: an axis is sought so far off at first, and at most
+TRIAL = 0.6 / FIRST  # part of the panel's width: between trials
+CLEAR = 0.5  # part of the trials' largest sum of squares: if the smallest is above it, it is not a minimum
 SINGULAR = 1e-12  # of the largest eigenvalue of the normal equations
-LONGEST = 4.0  # steps for differences that a number may change by at a time
-AGAIN = 3  # steps more, at most, with the derivatives of the last: until they are within the standard errors
-SPANS = 6  # of the scan's time, for standard errors
-FLOOR = 0.03  # of a step for differences: no standard error is smaller, since voxels are not the object
+LONGEST = 4.0  # most that a number changes at a time, in steps for differences
+AGAIN = 3  # more steps, at most, with the last derivatives, until they are within the standard errors
+SPANS = 6  # spans of the scan's time, for standard errors
+FLOOR = 0.03  # least standard error, in steps for differences: voxels are not the object
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class _Level:
         self.scan, self.count, self.names, self.response = coarse(scan, pixels), count, names, response
         self.folds = folds_of(self.scan.geometry)
         (nv, nu), (dv, du) = self.scan.geometry.nDetector, self.scan.geometry.dDetector
-        pixel = dict(u=du, v=dv, y=2 / max(nv, nu))  # of the yaw at the panel's edge
+        pixel = dict(u=du, v=dv, y=2 / max(nv, nu))  # a pixel of yaw is meant at the panel's edge
         self.steps = {name: 0.5 * pixel[name[0]] for name in names if name[0] in pixel}
         self.steps |= {} if response is None else response.names()
 
@@ -181,7 +181,7 @@ def search(
     chosen, best = here, r
     while True:
         sure = [name for name in names if name not in refused]
-        if sure and len(sure) < len(names):  # once more, with the others as given
+        if sure and len(sure) < len(names):  # once more, with the others left as given
             level.names, rows = sure, D[[names.index(name) for name in sure]]
             chosen = zero | {name: here[name] for name in sure}
             chosen, best = level.stepped(chosen, level.differences(chosen), rows)

@@ -41,7 +41,7 @@ def parser() -> Parser:
         '--method',
         default='fast',
         metavar='M',
-        help='of rows that name none: METHOD[:option=value,...] (default: fast)',
+        help='method of rows that name none: METHOD[:option=value,...] (default: fast)',
     )
     cluster_arguments(p)
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')

@@ -91,7 +91,7 @@ def guard(main: Callable[[], int | None]) -> None:
         sys.exit(130)
 
 
-# Neither in a call or a path, nor an option already.
+# An argument of Python, name=value, that is not in a call or a path and not an option already.
 ARGUMENT = re.compile(r"""(?<!-D )(?<!\w\()(?<![\w"'/.=-])([A-Za-z]\w*)=(\([^()]*\)|'[^']*'|[^\s'",;:()]+)""")
 
 
@@ -111,7 +111,7 @@ def with_options(message: str) -> str:
             return f'-D {name}={",".join(parts)}' if is_setting else match[0]
         if option.nargs == 0:
             return option.option_strings[-1] if value == 'True' else match[0]
-        several = len(parts) > 1 and option.nargs is None  # in one text, of a form of its own
+        several = len(parts) > 1 and option.nargs is None  # in one word, whose form the metavar shows
         return ' '.join([option.option_strings[-1], *([str(option.metavar)] if several else parts)])
 
     return ARGUMENT.sub(written, message)
@@ -139,7 +139,7 @@ def command_line(*options: str, without: Collection[str] = ()) -> str:
     return ' '.join([program, shlex.join([*(a for a in sys.argv[1:] if a not in without), *options])])
 
 
-SCANNER = 'scanner'  # the shipped scene of projections that come without one
+SCANNER = 'scanner'  # the shipped scene for projections that come without a scene
 
 
 def input_name(args: argparse.Namespace) -> str:
@@ -175,14 +175,14 @@ def input_arguments(parser: argparse.ArgumentParser) -> None:
         '--mu-water',
         type=float,
         metavar='MU',
-        help='attenuation of water per mm: a --volume in HU becomes MU (1 + HU / 1000) per mm (default: HU are mapped to '
-        'densities in [0, 1]); and of what --units hu writes, also of a --volume per mm',
+        help='attenuation of water per mm. A --volume in HU becomes MU (1 + HU / 1000) per mm (default: HU are mapped to '
+        'densities in [0, 1]). --units hu needs it, also for a --volume per mm',
     )
     parser.add_argument(
         '--units',
         choices=('1/mm', '1/cm', 'hu'),
         default='1/mm',
-        help='of the volume that is written: attenuation per mm (default) or per cm, or Hounsfield units, with --mu-water',
+        help='unit of the written volume: attenuation per mm (default) or per cm, or Hounsfield units, with --mu-water',
     )
 
 
@@ -211,7 +211,7 @@ def check_input(args: argparse.Namespace) -> None:
             )
         args.projections, args.scene = args.scene, SCANNER
     for name in ('projections', 'volume', 'complete', 'start'):
-        if getattr(args, name, None) == '':  # an unset variable of the shell's
+        if getattr(args, name, None) == '':  # from an unset variable of the shell
             raise InputError(f'--{name} names no file')
     if args.views is not None and args.views < 1:
         raise InputError(f'--views must be at least 1, not {args.views}')
@@ -270,7 +270,7 @@ def read_input(args: argparse.Namespace, scene: Any, views: int | None, seed: in
         return dataset
     volume = None
     if args.volume:
-        # With --units hu, --mu-water may be of what is written alone.
+        # With --units hu, --mu-water may concern only the written volume.
         only_hu = args.units != 'hu'
         volume = read_volume(args.volume, args.mu_water, args.shape, args.dtype, args.spacing, only_hu=only_hu)
     return take_scan(scene, views or 0, volume, seed, truth=not slab)
@@ -317,7 +317,7 @@ def cluster_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=0,
         metavar='N',
-        help='of a worker on the CPU (default: all that it has; of local:N, its share)',
+        help='CPU threads of a worker (default: all that it has; with local:N, its share)',
     )
 
 

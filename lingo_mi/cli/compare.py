@@ -35,7 +35,7 @@ def parser() -> Parser:
     p.add_argument(
         '--out', type=Path, default=Path('compare.html'), metavar='F.html', help='the page (default: compare.html)'
     )
-    p.add_argument('--title', default='', help='of the page')
+    p.add_argument('--title', default='', help='title of the page')
     p.add_argument('--force', action='store_true', help='replace an earlier page')
     return p
 

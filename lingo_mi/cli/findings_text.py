@@ -14,7 +14,7 @@ OBSTACLES = dict(
     gaps='pixels side by side in the plane of the source are not valid' + CALIBRATE,
     truncation='the object reaches over the edge of the panel' + CALIBRATE,
     empty='too few of them show anything',
-    aside='too few of them see the object from beside',
+    aside='too few of them see the object from the side',
 )
 
 

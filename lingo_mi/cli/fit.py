@@ -80,7 +80,7 @@ def parser() -> Parser:
     )
     p.add_argument('--resume', action='store_true', help='go on from the checkpoint in the output folder')
     p.add_argument('--force', action='store_true', help='replace an earlier result')
-    p.add_argument('--seed', type=int, default=0, metavar='N', help='of every random choice (default: 0)')
+    p.add_argument('--seed', type=int, default=0, metavar='N', help='seed of every random choice (default: 0)')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     p.add_argument(
         '-D',
@@ -102,7 +102,7 @@ def main() -> None:
     check_seed(args.seed)
     defined = definitions(args.define)
     args.scene = scene_path(args.scene)
-    scene_parameters = defaults(args.scene)  # a name of the scene goes before an option's
+    scene_parameters = defaults(args.scene)  # a parameter of the scene comes before an option of the same name
     method = method_of_arguments(
         args, {k: v for k, v in defined.items() if k not in scene_parameters}, scene_parameters
     )
@@ -140,7 +140,7 @@ def fit_scene(folder: Path, args: argparse.Namespace, method: Method, parameters
     from lingo_mi.fitting.measure import summary
     from lingo_mi.scene.load import load_scene
 
-    with locked(folder):  # refuses, before the work, what another process writes
+    with locked(folder):  # before the work: this refuses a folder that another process writes
         scene = load_scene(args.scene, parameters)
     scan = read_input(args, scene, args.views, args.seed)
     try:

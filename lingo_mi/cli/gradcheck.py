@@ -24,7 +24,7 @@ def parser() -> Parser:
         type=float,
         default=1e-4,
         metavar='H',
-        help="of the differences, in parts of a Gaussian's smallest standard deviation (default: 1e-4)",
+        help="step of the differences, in parts of a Gaussian's smallest standard deviation (default: 1e-4)",
     )
     p.add_argument(
         '-n',

@@ -32,8 +32,8 @@ def parser() -> Parser:
     add(
         '--geometry',
         metavar='F',
-        help="of the whole frames: .yml, a scanner's .xtekct (Nikon), .nsipro (NSI), .log (Bruker) or .pca (GE), or RTK's .xml "
-        "(default: what the frames' own file says: DICOM, .txrm)",
+        help="geometry of the whole frames: .yml, a scanner's .xtekct (Nikon), .nsipro (NSI), .log (Bruker) or .pca (GE), or "
+        "RTK's .xml (default: what the frames' own file says: DICOM, .txrm)",
     )
     add(
         '--out',
@@ -45,15 +45,26 @@ def parser() -> Parser:
     )
     add('--flats', metavar='F', help='frames without object')
     add('--darks', metavar='F', help='frames without beam')
-    add('--air', type=int, nargs=4, metavar=('V0', 'V1', 'U0', 'U1'), help='pixels without object in every view')
+    add(
+        '--air',
+        type=int,
+        nargs=4,
+        metavar=('V0', 'V1', 'U0', 'U1'),
+        help='pixels without object in every view, which give its air level',
+    )
     add(
         '--air-percentile',
         dest='percentile',
         type=float,
         metavar='P',
-        help='instead: a percentile of each view is its air level',
+        help='in place of --air: a percentile of each view is its air level',
     )
-    add('--i0', type=float, metavar='COUNTS', help='instead: the counts of the unattenuated beam above the dark ones')
+    add(
+        '--i0',
+        type=float,
+        metavar='COUNTS',
+        help='in place of --flats: counts of the unattenuated beam above the dark ones',
+    )
     add(
         '--exposure',
         metavar='X',

@@ -27,7 +27,7 @@ def table_arguments(parser: argparse.ArgumentParser) -> None:
         nargs='+',
         type=int,
         metavar='N',
-        help='fitted, of 50 (default: 5 10 25; ablation and controls: 25; scenes: 50)',
+        help='views to fit, of 50 (default: 5 10 25; ablation and controls: 25; scenes: 50)',
     )
     parser.add_argument('--first', action='store_true', help='fit the first views instead of evenly spaced ones')
     parser.add_argument(
@@ -35,7 +35,7 @@ def table_arguments(parser: argparse.ArgumentParser) -> None:
         nargs='+',
         type=int,
         metavar='N',
-        help='of the fits; ct and ablation take the largest (default: 5000 15000 30000; scale small: 5000)',
+        help='iterations of the fits; ct and ablation take the largest (default: 5000 15000 30000; scale small: 5000)',
     )
     parser.add_argument(
         '--methods',
@@ -60,7 +60,7 @@ def table_arguments(parser: argparse.ArgumentParser) -> None:
         type=int,
         default=[0],
         metavar='N',
-        help='of every random choice; a table has the means over several seeds and their spread (default: 0)',
+        help='seeds of every random choice; a table has the means over several seeds and their spread (default: 0)',
     )
     parser.add_argument('--record', type=Path, metavar='F.json', help='a file that keeps the numbers of all cells')
     cluster_arguments(parser)

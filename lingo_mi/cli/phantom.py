@@ -60,7 +60,7 @@ def parser() -> Parser:
         type=int,
         default=0,
         metavar='S',
-        help='texture, vessels, random Gaussians and held-out angles (default 0)',
+        help='seed of texture, vessels, random Gaussians and held-out angles (default 0)',
     )
     p.add_argument(
         '--attenuation',

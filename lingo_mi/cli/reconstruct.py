@@ -66,7 +66,7 @@ from lingo_mi.scene.shipped import scene_path
 from lingo_mi.storage.file_access import check_new_file, require_writable
 from lingo_mi.storage.folder_lock import writing_file
 
-IN_SLABS = 'fdk', 'sart', 'os-sart', 'sirt', 'asd-pocs', 'voxelize'  # those that need not hold the whole volume
+IN_SLABS = 'fdk', 'sart', 'os-sart', 'sirt', 'asd-pocs', 'voxelize'  # these need not hold the whole volume
 
 
 def parser() -> Parser:
@@ -85,7 +85,7 @@ def parser() -> Parser:
         help='folder of a fit, its result.xml or checkpoint.npz, from which missing views of a circle are rendered',
     )
     p.add_argument(
-        '--start', metavar='F', help='the same of a fit whose volume refined or an iterative algorithm starts from'
+        '--start', metavar='F', help='the same for a fit: refined or an iterative algorithm starts from its volume'
     )
     p.add_argument(
         '--out',
@@ -117,7 +117,7 @@ def parser() -> Parser:
         '--seed',
         type=int,
         metavar='N',
-        help="of a simulated detector's noise (default: 0; with --complete and --start the seed of the fit)",
+        help="seed of a simulated detector's noise (default: 0; with --complete and --start the seed of the fit)",
     )
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')
     p.add_argument(
@@ -212,7 +212,7 @@ def main() -> None:
     algorithm = algorithm_of(args, options)
     out = args.out or Path('out') / f'{input_name(args)}-{args.algorithm}.nii.gz'
     check_output(out, args)
-    with writing_file(out):  # refuses, before the work, what another process writes
+    with writing_file(out):  # before the work: this refuses a file that another process writes
         pass
     scene = load_scene(args.scene, {k: v for k, v in defined.items() if k in scene_parameters}, args.slab or 0)
     fit = load_fit(args.complete or args.start) if args.complete or args.start else None
@@ -252,7 +252,7 @@ def main() -> None:
     else:
         scanner = dataset.train.geometry
         views = measured or len(scanner)
-        completed = args.complete and args.algorithm != 'refined'  # which meets the measured views last
+        completed = args.complete and args.algorithm != 'refined'  # `refined` fits the measured views last
         of = f'a fit to {views}' if args.algorithm == 'voxelize' else str(args.views if completed else views)
         show(result, of, views, scanner, dataset.volume, out, args)
 

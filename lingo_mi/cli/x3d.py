@@ -31,10 +31,10 @@ def parser() -> Parser:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('folder', type=Path, metavar='DIR', help='with pickles NAME_50.pickle, and folders of R2-Gaussian')
     p.add_argument(
-        '--tables', nargs='+', choices=TABLES, default=list(TABLES[:3]), metavar='T', help='of views, ct, ablation, '
+        '--tables', nargs='+', choices=TABLES, default=list(TABLES[:3]), metavar='T', help='any of views, ct, ablation, '
         'controls, scenes (default: views ct ablation)',
     )  # fmt: skip
-    p.add_argument('--scenes', nargs='+', metavar='NAME', help='(default: all in the folder)')
+    p.add_argument('--scenes', nargs='+', metavar='NAME', help='scans to use (default: all in the folder)')
     p.add_argument('--out', type=Path, metavar='D', help='folder of the results (default: out/tables/<name of DIR>)')
     table_arguments(p)
     return p

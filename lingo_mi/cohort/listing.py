@@ -58,7 +58,7 @@ def read_list(path: PathLike | str, method: str = 'fast') -> list[Row]:
     header, records = _records(path)
     rows, bad, names = [], [], {}
     for line, cells in records:
-        where = f'{path.name}, line {line}'  # the path stands once, in the last line
+        where = f'{path.name}, line {line}'  # the last line has the whole path
         try:
             if len(cells) != len(header):
                 raise InputError(f'has {len(cells)} cells, but the header has {len(header)}')

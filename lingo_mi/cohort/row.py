@@ -20,7 +20,7 @@ from lingo_mi.storage.output_folder import CHECKPOINT, FILES, METRICS, occupants
 
 # How columns of a list are read; every other column is an option of the method, or a parameter of the row's scene.
 COLUMNS = 'name', 'file', 'geometry', 'method', 'views', 'seed', 'mu_water'
-CONTENT = 'content of the geometry'  # in a request
+CONTENT = 'content of the geometry'  # keys of a request
 SCAN = 'content of the scan'
 NAMED = 'content of files that the geometry names'
 SYSTEM = '.DS_Store', 'Thumbs.db', 'desktop.ini'  # what desktops leave in folders
@@ -108,7 +108,7 @@ class Row:
             request[SCAN] = _digest(_files(path, geometry if self.geometry else None))
         if others := self._named():
             request[NAMED] = _digest(others)
-        return json.loads(json.dumps(request | dict(bytes=size, settings=settings)))  # as a file has it
+        return json.loads(json.dumps(request | dict(bytes=size, settings=settings)))  # as if read from a file
 
     def _named(self):
         """The files that the geometry names and the numbers depend on."""

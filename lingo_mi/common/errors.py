@@ -15,7 +15,7 @@ def brief(text: object, longest: int = LONGEST) -> str:
     The name stays at the start and the remedy at the end, even if a file's text stands between them.
     """
     text = str(text)
-    if len(text) > 4 * longest:  # before every character is examined
+    if len(text) > 4 * longest:  # shorten it before every character is examined
         text = text[: 2 * longest] + text[-2 * longest :]
     line = printable(text)
     if len(line) <= longest:

@@ -20,7 +20,7 @@ LABELS = {
     'stops_at': 'stops at step {:,}',
 }
 REDRAW = 0.25  # seconds between two redraws on a terminal
-PAUSE = 1.0  # seconds between two plain lines at least, but for the last
+PAUSE = 1.0  # least seconds between two plain lines, except before the last
 LINE = 10.0  # seconds between two plain lines, if 10 % takes longer
 
 

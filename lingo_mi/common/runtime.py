@@ -74,7 +74,7 @@ def find_libllvm() -> str | None:
     if os.environ.get('DRJIT_LIBLLVM_PATH'):
         return os.environ['DRJIT_LIBLLVM_PATH']
     packages = [Path(p) for p in sys.path if p.endswith('site-packages')]
-    # Two folders above it, if there are so many.
+    # The environment is three folders above site-packages, if there are so many.
     roots = dict.fromkeys((sys.prefix, *(str(above) for p in packages for above in p.parents[2:3])))
     carried = ([os.path.join(root, pattern) for pattern in _IN_ENVIRONMENT.get(sys.platform, _LINUX)] for root in roots)
     for places in *carried, [_INSTALLED.get(sys.platform, '')]:

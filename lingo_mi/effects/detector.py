@@ -33,7 +33,7 @@ from lingo_mi.projectors.view import View
 RESPONSES = 'energy', 'count'
 MOST_PHOTONS = 1e15
 MOST_COUNTS = 1e18  # in a pixel, that numpy can draw
-FULL_SCALE = 1.25  # of the converter if no saturation is given; above the open beam with its noise
+FULL_SCALE = 1.25  # full scale of the converter without a saturation: above the open beam with its noise
 DARKEST = 1e-30  # least transmission without noise; float32 holds 1e-38
 _MAPS = 2**63  # added to a seed, so that gain and dead-pixel maps are independent of the noise
 

@@ -18,7 +18,7 @@ from lingo_mi.geometry.grid import Grid
 from lingo_mi.storage.file_access import new_folder, optional
 
 LEAST, MOST = np.iinfo(np.int16).min, np.iinfo(np.int16).max
-# What DICOM asks for, known or not.
+# Attributes that DICOM asks for, even if their values are unknown.
 REQUIRED = (
     *('PatientName', 'PatientID', 'PatientBirthDate', 'PatientSex', 'ReferringPhysicianName'),
     *('StudyDate', 'StudyTime', 'StudyID', 'AccessionNumber'),

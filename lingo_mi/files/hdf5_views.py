@@ -18,7 +18,7 @@ from lingo_mi.storage.file_access import optional, reading
 
 SUFFIXES = '.h5', '.hdf5', '.hdf', '.nxs', '.nx'
 EXCHANGE = 'exchange/data'  # where Data Exchange keeps projections
-RAW = 'exchange/data_white', 'exchange/data_dark'  # beside which they are raw frames
+RAW = 'exchange/data_white', 'exchange/data_dark'  # beside these, they are raw frames
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -40,7 +40,7 @@ class HDF5Views(FileViews):
             index = slice(first, last + 1) if last - first + 1 == len(rising) else rising
             try:
                 views = data[index]
-            except Exception as error:  # of filters: many kinds
+            except Exception as error:  # filters raise many kinds
                 raise InputError(
                     f'{self.path}: the views {span(numbers)} are damaged ({brief(error, 80)}); write it again'
                 ) from None
@@ -88,7 +88,7 @@ def hdf5_views(path: Path, dataset: str | None = None, rows_run_up: bool = False
             _require_whole(where, data)
         except InputError:
             raise
-        except Exception as error:  # of damaged headers: many kinds
+        except Exception as error:  # damaged headers raise many kinds
             raise InputError(f'{where} is damaged ({brief(error, 100)}); copy it again') from None
     return HDF5Views(path, shape, np.arange(shape[0]), rows_run_up, dataset=dataset or EXCHANGE)
 
@@ -112,7 +112,7 @@ def _opened(path: Path, name: str) -> Iterator[Any]:
         open(path, 'rb').close()
     try:
         file = h5py.File(path, 'r')
-    except Exception as error:  # of a damaged header: many kinds
+    except Exception as error:  # a damaged header raises many kinds
         raise InputError(f'{path}: is cut off, damaged or not HDF5 ({brief(error, 100)}); copy it again') from None
     with file:
         try:

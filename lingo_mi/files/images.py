@@ -46,7 +46,7 @@ def _write(file: OpenEXR.File, path: Path) -> None:
             other = Path(folder) / 'image.exr'
             file.write(str(other))
             path.write_bytes(other.read_bytes())
-    except RuntimeError as error:  # the library's, for a disk that is full and the like
+    except RuntimeError as error:  # from the library, for example if the disk is full
         raise OSError(one_line(error)) from None
 
 
@@ -61,7 +61,7 @@ def read_exr(path: PathLike | str) -> np.ndarray:
     with reading(path):
         with open(path, 'rb') as stream:
             shape, pixel = _shape(stream.read(_LONGEST_HEADER), path)
-        # Of every block of lines there is an offset of 8 bytes.
+        # Every block of lines has an offset of 8 bytes.
         if shape[0] > os.path.getsize(path) // 8 * _MOST_LINES:
             raise InputError(f'{path}: is damaged: its header claims {shape[0]} lines; write it again')
         require_room(shape[0] * shape[1] * pixel * 2, path)

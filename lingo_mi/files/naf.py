@@ -276,7 +276,7 @@ def _split(data, name, where):
 
 def _as_array(value, label, ndim) -> np.ndarray:
     try:
-        # Of lists with texts NumPy would make texts, all as long as the longest.
+        # NumPy would turn lists with texts into texts, all as long as the longest.
         return value if isinstance(value, np.ndarray) else np.asarray(value, float)
     except (ValueError, TypeError, OverflowError, MemoryError):
         raise InputError(f'{label} is not an array; store {ndim} dimensions of numbers') from None

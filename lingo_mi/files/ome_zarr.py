@@ -16,7 +16,7 @@ from lingo_mi.common.errors import InputError, brief, shown
 from lingo_mi.common.memory import require_room
 from lingo_mi.storage.file_access import optional, read_json, reading
 
-# What numbers are packed with. Others, such as pickle, can run a stranger's code.
+# Codecs that pack numbers. Others, such as pickle, can run a stranger's code.
 CODECS = {'bytes', 'transpose', 'sharding_indexed', 'crc32c', 'gzip', 'zlib', 'bz2', 'lzma', 'lz4', 'zstd', 'blosc'}
 MILLIMETRES = {'millimeter': 1.0, 'micrometer': 1e-3, 'nanometer': 1e-6, 'centimeter': 10.0, 'meter': 1e3, None: 1.0}
 SPACE = 'x', 'y', 'z'
@@ -55,7 +55,7 @@ def read_ome_zarr(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
         try:
             array: Any = zarr.open_array(str(folder), mode='r', zarr_format=version)
             shape, dtype = tuple(int(n) for n in array.shape), np.dtype(array.dtype)
-        except Exception as error:  # of zarr: many kinds
+        except Exception as error:  # zarr raises many kinds
             fail(f'is damaged ({brief(error, 100)}); fetch it again')
         if len(shape) != len(names) or dtype.kind not in 'buif':
             fail(f'has values of the type {dtype} in the shape {list(shape)}, not one number a voxel')
@@ -66,7 +66,7 @@ def read_ome_zarr(path: Path) -> tuple[np.ndarray, np.ndarray, str]:
         require_room(together * (dtype.itemsize + 8), path)
         try:
             values = np.asarray(array[...])
-        except Exception as error:  # of codecs: many kinds
+        except Exception as error:  # codecs raise many kinds
             fail(f'is damaged: its data cannot be unpacked ({brief(error, 100)}); fetch it again')
     spatial = [i for i, name in enumerate(names) if name in SPACE]
     values = values.reshape([shape[i] for i in spatial])

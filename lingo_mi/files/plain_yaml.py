@@ -71,5 +71,5 @@ def read_yaml(path: PathLike | str) -> Any:
         return yaml.load(text, _Loader)
     except InputError as error:
         raise InputError(f'{path}: {error}') from None
-    except Exception as error:  # values of the form of a number or a date that are none fail in many ways
+    except Exception as error:  # values that look like numbers or dates, but are not, fail in many ways
         raise InputError(f'{path}: is not valid YAML ({one_line(error)}); correct it') from None

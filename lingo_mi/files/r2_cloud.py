@@ -25,7 +25,7 @@ from lingo_mi.files.naf import load_pickle, write_pickle
 from lingo_mi.files.ply import check_cloud
 from lingo_mi.geometry.grid import Grid
 
-NEAREST = 1e-3  # the least distance of neighbours, in its world
+NEAREST = 1e-3  # least distance of neighbours, in R2-Gaussian's world
 LEAST = 1e-12  # density whose inverse softplus is finite
 _COLUMNS = {'xyz': 3, 'scale': 3, 'rotation': 4, 'density': 1}
 _Cloud = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]

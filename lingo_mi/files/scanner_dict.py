@@ -24,7 +24,7 @@ def _floats(value) -> np.ndarray:
     """Raises ValueError, TypeError or OverflowError for anything but numbers, also for true and false."""
     if isinstance(value, np.ndarray) and value.dtype.kind not in 'uif':
         raise ValueError
-    array = np.asarray(value, float)  # first: it refuses what is nested too deep to be looked through
+    array = np.asarray(value, float)  # comes first: it refuses values that are nested too deep to be searched
     if _has_truth(value):
         raise ValueError
     return array

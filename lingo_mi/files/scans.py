@@ -51,7 +51,7 @@ from lingo_mi.geometry import Geometry, astra
 from lingo_mi.scan import Dataset, Scan
 from lingo_mi.storage.file_access import new_folder, reading, replacing, take_place
 
-MOST_LISTED = 1000  # poses in a geometry file
+MOST_LISTED = 1000  # most poses that a geometry file lists
 FRAMES = {  # raw ones
     *('.tif', '.tiff', '.edf', '.png', '.jp2', '.j2k', '.jpx', '.his', '.hnd', '.hnc', '.xim'),
     *(*SUFFIXES, '.dcm', '.ima', '.txrm', '.xrm'),
@@ -148,7 +148,7 @@ def new_zarr_scan(path: Path, geometry: Geometry) -> Iterator[ChunkedScan]:
     with ExitStack() as files:
         folder = files.enter_context(new_folder(path))
         array = new_zarr_views(folder, shape)
-        mask = np.lib.format.open_memmap(folder / VALID, 'w+', bool, shape)  # here while nobody knows if it is needed
+        mask = np.lib.format.open_memmap(folder / VALID, 'w+', bool, shape)  # until it is known if it is needed
         scan = ChunkedScan(array, mask)
         yield scan
         all_valid = all(view.all() for view in mask)

@@ -19,11 +19,11 @@ from lingo_mi.storage.file_access import one_line, optional, quiet, reading
 
 _KINDS = {'imagej', 'shaped', 'uniform', 'volumetric', 'bigtiff'}  # of TIFF files, in tifffile's words
 _DEFLATED_DICOM = '1.2.840.10008.1.2.1.99'
-# What a byte may stand for in the compressions that bound it, by TIFF's numbers: none, LZW, deflate twice, PackBits.
+# Most bytes that one byte may stand for, by TIFF's number of the compression: none, LZW, deflate twice, PackBits.
 _RATIO = {1: 1, 5: 4096, 8: 1032, 32946: 1032, 32773: 64}
 
 
-# Of the units that ImageJ and OME write: mm.
+# Millimetres of the units that ImageJ and OME write.
 _MILLIMETRES = {
     **dict.fromkeys(('um', '\u00b5m', '\u03bcm', '\\u00b5m', 'micron', 'microns', 'micrometer'), 1e-3),
     **dict.fromkeys(('mm', 'millimeter', 'millimeters'), 1.0),

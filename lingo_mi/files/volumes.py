@@ -223,7 +223,7 @@ def read_volume(
         data, affine, description = ome_zarr.read_ome_zarr(path)
     elif path.is_dir():
         data, affine, tiff = slices.read_folder(path)
-        hu = True if hu is None and affine is not None else hu  # DICOM's
+        hu = True if hu is None and affine is not None else hu  # DICOM has HU
     elif shape is not None and dtype is not None or name.endswith('.raw'):
         data = _raw(path, shape, dtype)
     elif name.endswith(('.nii', '.nii.gz', '.hdr', '.img')):

@@ -15,7 +15,7 @@ from lingo_mi.files.ome_zarr import require_codecs
 from lingo_mi.files.stored_views import FileViews, require_projections, span
 from lingo_mi.storage.file_access import optional, reading
 
-VIEWS = 4  # of a chunk that is written
+VIEWS = 4  # views of a chunk that is written
 
 
 class ZarrViews(FileViews):
@@ -29,7 +29,7 @@ class ZarrViews(FileViews):
                 return array.oindex[numbers]
         except InputError:
             raise
-        except Exception as error:  # of codecs: many kinds
+        except Exception as error:  # codecs raise many kinds
             raise InputError(
                 f'{self.path}: a chunk of the views {span(numbers)} is cut off or damaged ({brief(error, 80)}); write it again'
             ) from None
@@ -103,7 +103,7 @@ def _opened(path: Path) -> Any:
         version = require_codecs(path, path)
         try:
             return zarr.open_array(str(path), mode='r', zarr_format=version)
-        except Exception as error:  # of zarr: many kinds
+        except Exception as error:  # zarr raises many kinds
             raise InputError(f'{path}: is damaged ({brief(error, 100)}); write it again') from None
 
 

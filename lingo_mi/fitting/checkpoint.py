@@ -199,7 +199,7 @@ def _text(array: np.ndarray) -> str:
 def _array(file: io.BufferedReader, entry: zipfile.ZipInfo) -> np.ndarray:
     """The array in an entry, writable, from the file straight into its memory. Raises InputError if the entry's check sum is
     wrong, or its header claims another size than it has, or objects."""
-    file.seek(entry.header_offset + 26)  # where the lengths stand of what goes before the content
+    file.seek(entry.header_offset + 26)  # the lengths of the parts before the content
     name, more = struct.unpack('<HH', file.read(4))
     file.seek(name + more, os.SEEK_CUR)
     content = bytearray(entry.file_size)
@@ -209,7 +209,7 @@ def _array(file: io.BufferedReader, entry: zipfile.ZipInfo) -> np.ndarray:
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     try:
         shape, columns_first, kind = read[np.lib.format.read_magic(header)](header)
-    except (KeyError, MemoryError, SyntaxError, TypeError, ValueError, tokenize.TokenError):  # an expression
+    except (KeyError, MemoryError, SyntaxError, TypeError, ValueError, tokenize.TokenError):  # NumPy evaluates it
         raise InputError('an entry is not an array') from None
     count, begin = math.prod(shape), header.tell()
     if kind.hasobject or any(n < 0 for n in shape) or count * kind.itemsize != len(content) - begin:

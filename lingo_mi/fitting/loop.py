@@ -82,7 +82,7 @@ def run(
         if path is None:
             raise InputError('a fit that goes on needs the path of its checkpoint')
         require_same_fit(stored := Checkpoint.load(path), method, scan, seed, path)
-    last, search = method.iterations, None  # a record
+    last, search = method.iterations, None  # `search` is a record
     if method.stopping.stop == 'on':
         if stored is None or stored.searching:
             search, stored = _search(scan, method, wanted, seed, progress, path, stored, cluster), None

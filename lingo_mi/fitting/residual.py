@@ -7,7 +7,7 @@ import numpy as np
 from lingo_mi.raw.line_integrals import photons_of_images
 from lingo_mi.scan import Scan
 
-MOST_PHOTONS = 1e8  # a pixel: what looks like less noise than theirs is rounding
+MOST_PHOTONS = 1e8  # a pixel: an estimate of less noise than theirs is rounding
 
 
 def residual_numbers(rendered: np.ndarray, test: Scan) -> dict:

@@ -89,9 +89,9 @@ def write_fit(
     numbers = numbers | description(fit)
     try:
         write_report(folder, report(numbers))
-    except InputError:  # the disk is full, and the like
+    except InputError:  # for example, the disk is full
         raise
-    except Exception as error:  # of the libraries that draw: the numbers are worth more than their picture
+    except Exception as error:  # libraries that draw may fail: the numbers are worth more than their picture
         warnings.warn(
             f'{folder}: the report could not be drawn ({brief(error, 150)}); all else is written', stacklevel=2
         )

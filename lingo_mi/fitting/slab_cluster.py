@@ -27,7 +27,7 @@ def voxelize_on(runner: Runner, fit: FittedModel, grid: Grid, thickness: int, pa
     InputError
         If a slab fails twice, the file cannot be written, or its folder holds slabs of other work.
     """
-    fit.volume(grid.slab(0, 1))  # refuses, here, a method without a volume
+    fit.volume(grid.slab(0, 1))  # refuses a method without a volume in this process
     folder = work_folder(path)
     with locked(folder), exchange_folder(folder) as exchange:
         checkpoint = exchange / 'fit.npz'

@@ -93,11 +93,6 @@ def differentiate(
 ) -> tuple[Any, Any, Any, Any]:
     """Add the gradient of one view's loss to the gradient of the Gaussians (with gradients enabled).
 
-    1. the view's part of the loss, Float [1], not multiplied by the loss scale
-    2. the norm of the gradient with respect to each projected centre, Float [N], for densification
-    3. 1 for each Gaussian that is visible, else 0, Float [N], for densification
-    4. the view's part of the loss scale, Float [1]; None without one
-
     Parameters
     ----------
     loss : ImageLoss
@@ -115,6 +110,11 @@ def differentiate(
     -------
     tuple[Any, Any, Any, Any]
         Four values:
+
+        1. the view's part of the loss, Float [1], not multiplied by the loss scale
+        2. the norm of the gradient with respect to each projected centre, Float [N], for densification
+        3. 1 for each Gaussian that is visible, else 0, Float [N], for densification
+        4. the view's part of the loss scale, Float [1]; None without one
     """
     view = target.view
     bundles = []  # of rays: one, or several if the signal is a mean over them
@@ -151,7 +151,7 @@ def differentiate(
 
 def _sum(a, b):
     total = a[0] + b[0], a[1] + b[1]
-    dr.eval(total)  # one by one, as below
+    dr.eval(total)  # one by one, for the same reason as bundles
     return total
 
 

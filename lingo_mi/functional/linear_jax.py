@@ -27,7 +27,7 @@ def _shape(x, linear_map):
 
 
 def _values(x, *, map):
-    if not isinstance(x, Tracer):  # errors are ours, not JAX's around them
+    if not isinstance(x, Tracer):  # JAX would wrap our errors
         return jnp.asarray(map.on_host(np.asarray(x)))
     result = jax.ShapeDtypeStruct(_shape(x, map), jnp.float32)
     return jax.pure_callback(lambda x: map.on_host(np.asarray(x)), result, x)

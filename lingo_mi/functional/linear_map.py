@@ -18,8 +18,8 @@ from lingo_mi.common.runtime import drjit_lock, ensure_variant
 from lingo_mi.functional.frameworks import framework_of
 from lingo_mi.projectors.upload import uploaded
 
-LARGE = 2**26  # bytes of a result above which it is asked whether they fit: that reads files, half a millisecond
-BASIS, FEW = 12, 4  # vectors of the Krylov space of `norm`, of an accurate one and of a rough one
+LARGE = 2**26  # bytes: only larger results are checked to fit, since the check reads files for half a millisecond
+BASIS, FEW = 12, 4  # vectors of the Krylov space for an accurate norm, and for a rough one
 
 
 class LinearMap(ABC):

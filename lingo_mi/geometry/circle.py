@@ -13,7 +13,7 @@ from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.rays import Index, Rays, checked_views
 from lingo_mi.geometry.trajectories import scanner_rays
 
-SAME = 1e-3  # pixels by which a pose may miss a circle and still be one
+SAME = 1e-3  # pixels by which a pose may miss a circle and still count as on it
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
@@ -120,7 +120,7 @@ def circle_of(rays: Rays, nDetector: tuple[int, int]) -> dict[str, Any] | None:
     if not rays.parallel and not DSD >= DSO > 0:
         return None
     like = scanner_rays(angles, DSO, DSD, nDetector, (step_v, step_u), rays.parallel, offDetector=offset)
-    # A beam's direction moves what it meets at a distance.
+    # An error of the beam's direction grows with the distance.
     reach = np.linalg.norm(rays.corner, axis=1).max() if rays.parallel else 1
     allowed = SAME * min(step_v, step_u)
     near = all(

@@ -165,12 +165,12 @@ def curved(geometry: Geometry, radius: float | None) -> CurvedGeometry:
     rays = geometry.rays()
     require_bendable(rays)
     radius = float(limits.sizes('radius', geometry.DSD if radius is None else radius, 1)[0])
-    # The source's foot along u from the panel's middle. There the flat panel is touched; what is left is gone along the arc.
+    # The source's foot along u from the panel's middle. The arc touches the flat panel there; the rest goes along the arc.
     step = np.linalg.norm(rays.u, axis=1)
     off = np.sum((rays.source - rays.centre(geometry.nDetector)) * rays.u, 1) / step
     if np.abs(off / step).max() > SAME:
         touching = replace(rays, corner=rays.corner + (off / step)[:, None] * rays.u)
-        curve_of(rays, geometry.nDetector, radius)  # refuses what cannot be gone along
+        curve_of(rays, geometry.nDetector, radius)  # refuses an arc that cannot be followed
         geometry = from_poses(slid(touching, geometry.nDetector, radius, -off), geometry.nDetector, geometry.grid)
     return CurvedGeometry(flat=geometry, radius=radius)
 

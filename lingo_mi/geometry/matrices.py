@@ -50,7 +50,7 @@ def from_matrices(
     if not np.all(np.abs(matrices) < MOST):
         raise InputError(f'a projection matrix holds NaN or infinity, or numbers beyond {MOST:.0e}')
     P = np.linalg.inv(_TO_INDEX) @ matrices
-    with np.errstate(all='ignore'):  # of what is not a pose, which `checked` refuses
+    with np.errstate(all='ignore'):  # `checked` refuses what is not a pose
         rows = list(_parallel(P, towards) if parallel else _cone(P, towards, dDetector[1]))
     return Rays(*(np.array(column) for column in zip(*rows)), parallel=parallel).checked()
 

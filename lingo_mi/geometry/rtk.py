@@ -220,7 +220,7 @@ def _views(path):
     try:
         with reading(path):
             text = Path(path).read_text(encoding='utf-8')
-        if '<!ENTITY' in text:  # one may stand for many others
+        if '<!ENTITY' in text:  # an entity may stand for many others
             raise InputError(f'{path}: defines entities, which no geometry of RTK needs; remove them')
         parser, depth = ElementTree.XMLPullParser(('start', 'end')), 0
         parser.feed(text)

@@ -82,7 +82,7 @@ def scan(geo: Any, angles: ArrayLike) -> Geometry:
         mode = 'cone'
     if not isinstance(mode, str):
         raise InputError(f"mode of the TIGRE geometry must be 'cone' or 'parallel', not {shown(mode)}")
-    far = 0.0 if mode == 'parallel' else None  # of a parallel beam they only place the panel
+    far = 0.0 if mode == 'parallel' else None  # in a parallel beam they only place the panel
     voxels: dict[str, Any] = dict(
         nVoxel=each('nVoxel', 3)[..., ::-1],
         dVoxel=steps('Voxel', 3)[..., ::-1],
@@ -99,7 +99,7 @@ def scan(geo: Any, angles: ArrayLike) -> Geometry:
     )
     # TIGRE's angles about x, y, z are this package's yaw, pitch and roll.
     motion: dict[str, Any] = dict(rotDetector=each('rotDetector', 3, np.zeros(3))[..., ::-1], COR=each('COR', 1, 0.0))
-    plain = dict(DSO=0, DSD=0, offOrigin=1, offDetector=1, angles=1)  # dimensions of what no view changes
+    plain = dict(DSO=0, DSD=0, offOrigin=1, offDetector=1, angles=1)  # dimensions of numbers that hold for all views
     moves = any(np.ndim((numbers | voxels)[name]) > n for name, n in plain.items())
     if moves or any(np.any(x) for x in motion.values()):
         return Geometry.per_view(**numbers, **motion, **voxels)

@@ -13,14 +13,14 @@ from numpy.polynomial import legendre
 
 from lingo_mi.scan import Scan
 
-STRIP = 32  # a strip at the edge is this part of the panel's width, but two pixels at least
-NEAR = 0.1  # of the highest line integral: air is that near to the lowest at the edges
-ALL = 0.95  # of the pixels of a strip that are air, in all views together
-LOW = 0.2  # of the highest line integral: air is not higher
-BLOCKS, ROWS = 8, 8  # medians along a strip; and rows that a slope along the columns needs
-FLAT = 0.01  # of the highest line integral, rms: air is a plane, and the edge of an object is none
-DEGREE, SURE = 3, 3.0  # of polynomials in time; and the standard errors from which they are a drift
-LEAST = 1e-3  # of the highest line integral: smaller levels do no harm
+STRIP = 32  # a strip at an edge is the panel's width over this, and two pixels at least
+NEAR = 0.1  # part of the highest line integral: air is so near to the lowest at the edges
+ALL = 0.95  # least part of a strip's pixels that are air, in all views together
+LOW = 0.2  # part of the highest line integral: air is not higher
+BLOCKS, ROWS = 8, 8  # medians along a strip; rows that a slope along the columns needs
+FLAT = 0.01  # part of the highest line integral, rms: air is a plane, and the edge of an object is not
+DEGREE, SURE = 3, 3.0  # degree of polynomials in time; standard errors from which they are a drift
+LEAST = 1e-3  # part of the highest line integral: smaller levels do no harm
 
 
 @dataclass(frozen=True)

@@ -6,8 +6,8 @@ import numpy as np
 
 from lingo_mi.scan import Scan
 
-STILL = 0.1  # of the neighbours' change from view to view: a dead column changes less
-REACH = 4  # columns to either side: so wide, and one less, may a dead stripe be
+STILL = 0.1  # part of the neighbours' change from view to view: a dead column changes less
+REACH = 4  # columns to either side: a dead stripe may be so wide
 
 
 def dead_columns(scan: Scan) -> list[int]:

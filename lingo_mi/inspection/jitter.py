@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-LEVEL = 0.15  # of the highest value: where the outline is taken
+LEVEL = 0.15  # part of the highest value at which the outline is taken
 STEEPEST = np.radians(6)  # between views: beyond, an outline's own motion is not smooth
 
 

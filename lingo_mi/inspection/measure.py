@@ -17,27 +17,25 @@ from lingo_mi.inspection.text_order import text_order
 from lingo_mi.raw.line_integrals import MOST_VIEWS, photons_of_images
 from lingo_mi.scan import PIECE, Scan
 
-COLUMNS = 128  # of the plane: enough for a tenth of a pixel, few for all pairs
-VIEWS = 40  # of the plane: the time goes with its square
-CLEAR = 0.01  # a disagreement that is more than discretisation
-UNSTEADY = 0.5  # pixels of jitter that blur a volume
+COLUMNS = 128  # of the plane: enough for a tenth of a pixel, and few enough for all pairs
+VIEWS = 40  # of the plane: the time grows with the square
+CLEAR = 0.01  # a larger disagreement is more than discretisation
+UNSTEADY = 0.5  # more pixels of jitter blur a volume
 AIR_OFF = 0.01  # relative to the highest line integral
 UNEQUAL_AIR = 0.01  # relative to the highest line integral
-UNSTEADY_AIR = 0.002  # likewise, where air is clear of the object in all views
-BRIGHT, FLAT = 0.85, 0.25  # air in intensities: this part of the highest, and within this part of the contrast
-DARK = 0.7  # of the air in intensities: the object lies below
-HALF_TURN = 175  # degrees: views of less do not tell the axis
-WIDE = 2  # half a panel over its distance from the source, which no panel has
-BLOCK = (
-    5,
-    3,
-)  # pixels along the edge of the panel and across: their median is taken, since a noisy pixel is not the object
-SURE = 6  # standard deviations above air that are the object
+UNSTEADY_AIR = 0.002  # the same, if air is clear of the object in all views
+BRIGHT, FLAT = 0.85, 0.25  # intensities of air: at least this part of the highest, and within this part of the contrast
+DARK = 0.7  # part of the intensity of air: the object lies below
+HALF_TURN = 175  # degrees: views over less do not tell the axis
+WIDE = 2  # half a panel over its distance from the source: no panel has so much
+# Pixels along the edge of the panel and across: their median is taken, because a noisy pixel is not the object.
+BLOCK = (5, 3)
+SURE = 6  # standard deviations above air: pixels beyond are the object
 UNEQUAL = 0.03  # relative deviation of the masses of parallel views that discretisation does not explain
 
 
 # Why the consistency of the views is not measured: the scanner leaves the circle, the panel does not see the plane of the source
-# or has gaps there, the object reaches over its edge, too few views show anything, or too few see the object from beside.
+# or has gaps there, the object reaches over its edge, too few views show anything, or too few see the object from the side.
 Obstacle = Literal['orbit', 'panel', 'gaps', 'truncation', 'empty', 'aside']
 
 
@@ -316,7 +314,7 @@ def _border(p, valid, high):
         return None
     low = np.percentile(values, 5)
     near = values[values <= low + 0.1 * (high - low)]
-    even = low < 0.5 * high and near.size > 0.9 * values.size  # all around: air, but not at 0
+    even = low < 0.5 * high and near.size > 0.9 * values.size  # air all around, but not at 0
     air = spread = None
     if low <= 0.2 * high or even:
         air = float(np.median(near))
@@ -337,7 +335,7 @@ def _outer(p):
 def _medians(blocks):
     """Along the last axis, of what is not NaN."""
     with warnings.catch_warnings():
-        warnings.simplefilter('ignore', RuntimeWarning)  # of blocks of NaN alone
+        warnings.simplefilter('ignore', RuntimeWarning)  # from blocks of NaN alone
         return np.nanmedian(blocks, -1)
 
 

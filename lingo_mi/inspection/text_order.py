@@ -6,8 +6,9 @@ import numpy as np
 
 from lingo_mi.scan import Scan
 
-SMOOTHER = 0.7  # times the squared differences of neighbouring views: in the order of the numbers they are less
-BLOCKS = 32  # of a view along either side, whose means are compared
+# If the order of the numbers lowers the squared differences of neighbouring views by this factor, it is taken.
+SMOOTHER = 0.7
+BLOCKS = 32  # blocks of a view along either side: their means are compared
 
 
 def text_order(scan: Scan) -> np.ndarray | None:

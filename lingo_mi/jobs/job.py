@@ -87,7 +87,7 @@ def attempt(job: Job, report: Callable[..., None], tell: Tell) -> Event:
         return Event(job.name, 'failed', brief(error))
     except MemoryError as error:
         return Event(job.name, 'failed', f'not enough memory ({brief(error, 200)})')
-    except Exception as error:  # of one job: the others are worth having
+    except Exception as error:  # one job failed: the others are worth having
         traceback.print_exc()
         return Event(job.name, 'failed', brief(f'{type(error).__name__}: {error}'))
 

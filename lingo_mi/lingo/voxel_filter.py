@@ -84,7 +84,7 @@ def _candidates(matrices, low_images, grid, half, misses, outside):
         x0, x1, y0, y1 = (
             np.clip(q, 0, shape[1 - axis]).astype(np.int32) for axis in (0, 1) for q in (first[axis], last[axis])
         )
-        table = np.zeros((shape[0] + 1, shape[1] + 1), np.int32)  # pixels of the mask above and left
+        table = np.zeros((shape[0] + 1, shape[1] + 1), np.int32)  # pixels of the mask above and to the left
         np.cumsum(np.cumsum(image, 0, dtype=np.int32), 1, out=table[1:, 1:])
         empty = in_front & (table[y1, x1] - table[y0, x1] - table[y1, x0] + table[y0, x0] == 0)
         if outside == 'ignore':

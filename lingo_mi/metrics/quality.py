@@ -34,7 +34,7 @@ from lingo_mi.common.runtime import cores
 WINDOW = np.exp(-(np.arange(-5, 6) ** 2) / (2 * 1.5**2))
 WINDOW /= WINDOW.sum()
 C1, C2 = 0.01**2, 0.03**2
-# Values that are made float64 at once: the whole of a large volume, with its temporaries, takes ten times itself.
+# Values that are made float64 at once: a large volume as a whole, with temporaries, would take ten times its own memory.
 SLAB = 2**23
 THREADS = 8  # at most, and fewer for large views
 

@@ -23,7 +23,7 @@ from lingo_mi.common.arrays import short_repr
 from lingo_mi.common.errors import InputError, shown
 from lingo_mi.geometry import Geometry, Grid
 
-# Of a density of 1, per mm, where densities are real: 2000 HU, dense cortical bone, with water of 0.0206 per mm at 60 keV (NIST,
+# Attenuation per mm of a density of 1, if it is real: 2000 HU, dense cortical bone, with water of 0.0206 per mm at 60 keV (NIST,
 # X-ray mass attenuation coefficients). R2-Gaussian's rule maps Hounsfield units to [0, 1] with the same upper end.
 DENSEST = 3 * 0.0206
 ATTENUATIONS = 'x3d', 'real'

@@ -27,10 +27,10 @@ import mitsuba as mi
 from lingo_mi.common.gpu import gpu, resident_warps
 from lingo_mi.projectors.depth import hashed
 
-while_loop: Any = dr.while_loop  # as it is declared, a loop has one variable
+while_loop: Any = dr.while_loop  # it is declared for loops with one variable
 
 PACKET = 4  # numbers of an item that a lane loads at once
-MOST_PARTS = 256  # images of parts of the items in one launch
+MOST_PARTS = 256  # images, each of a part of the items, in one launch
 MOST_COPIED = 1 << 25  # packets in all copies of a target (512 MB); a larger one is shared, with atomics
 
 

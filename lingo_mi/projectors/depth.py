@@ -60,7 +60,8 @@ def deepest(places: Sequence, covered: Any, shape: Sequence[int]) -> Any:
         i, every = dr.arange(mi.UInt32, count // step), dr.opaque(mi.UInt32, step)
         i = i * every + hashed(i) % every
         covered = dr.gather(mi.Float, covered, i)
-        covered = dr.select(dr.isfinite(covered), covered, 0)  # others make NaN of the result, not of a number of parts
+        # Values that are not finite make the result NaN, but must not make the number of parts NaN.
+        covered = dr.select(dr.isfinite(covered), covered, 0)
         inside = [dr.clip(dr.gather(mi.Int32, p, i), 0, n - 1) for p, n in zip(places, shape)]
         depth = dr.zeros(mi.Float, sum(cells ** len(shape) for cells, _ in levels) + 1)
         first = 0

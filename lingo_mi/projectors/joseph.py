@@ -33,7 +33,7 @@ COLUMN = 8  # floats per detector column
 RUN = 8  # voxels per lane of the transpose
 ROWS = 4  # most rows of the panel that its innermost loop unrolls
 TILT = 1e-3  # pixels that corners of an upright panel may be off
-MOST_ROWS = 64  # of a small panel that rays of one voxel may meet
+MOST_ROWS = 64  # rows of a small panel that rays of one voxel may meet
 
 
 def column_table(geometry: Geometry) -> np.ndarray:

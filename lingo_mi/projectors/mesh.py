@@ -184,7 +184,7 @@ def from_mitsuba(shape: mi.Shape) -> MeshPaths:
     """
     name = shape.id()
     parameters = mi.traverse(shape)
-    if not (shape.is_mesh() and 'vertex_positions' in parameters):  # a rectangle is one without
+    if not (shape.is_mesh() and 'vertex_positions' in parameters):  # a rectangle is a mesh without them
         raise InputError(f'the shape {name!r} is not a triangle mesh: use a ply, obj or cube shape, for example')
     vertices, faces = (np.array(parameters[key]).reshape(-1, 3) for key in ('vertex_positions', 'faces'))
     return MeshPaths(vertices, faces, name)
@@ -292,7 +292,7 @@ def _row(long, lower, upper, parity, row, row_end, width):
     is_lower = y < upper[1]
     (x1, q1), (x2, q2) = _cross(lower, y), _cross(upper, y)
     x1, q1 = dr.select(is_lower, x1, x2), dr.select(is_lower, q1, q2)
-    # With an even order of vertices, the long edge runs against y: on the left it means a positive area.
+    # If the order of vertices is even, the long edge runs against y: on the left it belongs to a positive area.
     swap = x0 > x1
     sign = mi.Float(dr.select(swap, -parity, parity))
     first, last = _first_centre(dr.minimum(x0, x1), width), _first_centre(dr.maximum(x0, x1), width)

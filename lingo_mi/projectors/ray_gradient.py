@@ -30,7 +30,7 @@ from lingo_mi.projectors.stack import Gathered, span
 from lingo_mi.projectors.tilted_joseph import Axes, Ray
 from lingo_mi.projectors.view import View, vector64
 
-ASIDE = 1.2e-4, 2e-4, 3.2e-4  # voxels; no ray between voxel centres, along or across, stays in its plane
+ASIDE = 1.2e-4, 2e-4, 3.2e-4  # voxels: moved by these, rays between voxel centres, along or across, leave their plane
 
 
 def moving(volume: Any, geometry: Geometry, kind: type[Gathered | GridPair], view: View) -> Any:
@@ -48,7 +48,7 @@ def moving(volume: Any, geometry: Geometry, kind: type[Gathered | GridPair], vie
     half, size = mi.Vector3f(*(s / 2 for s in geometry.grid.size)), geometry.grid.shape
     lines = _lines(view, geometry)
     walk, length = walk_along(size, -half, half, lines, *whole_box(size))
-    # A component that is zero is kept away from it, and would lose its derivative.
+    # The walk keeps zero components away from zero, which would lose their derivative.
     walk.d = dr.replace_grad(walk.d, lines.direction / mi.Vector3f(*geometry.grid.spacing))
     volume = dr.detach(volume)
     if kind is GridPair:

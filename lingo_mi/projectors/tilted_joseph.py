@@ -96,7 +96,7 @@ class TiltedJoseph(Gathered):
     def _weighted(self, images, block, ones):
         pixels = self.pixels_of(block)
         path = dr.select(self.used(*pixels), self._ray(*pixels).path, 0)
-        value = dr.select(path > 0, path * images, 0)  # whatever stands in invalid pixels
+        value = dr.select(path > 0, path * images, 0)  # invalid pixels become 0, whatever stands in them
         return dr.ravel(mi.Vector2f(value, path)) if ones else value
 
     def _collect(self, weighted, block, ones):

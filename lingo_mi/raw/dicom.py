@@ -109,6 +109,6 @@ def _pixels(file, k):
     """Frame k of a file, as its pixels are stored."""
     try:
         return optional('pydicom.pixels').pixel_array(file, index=k)
-    except Exception as error:  # pydicom and what decompresses for it fail in many ways
+    except Exception as error:  # pydicom and its decompressors fail in many ways
         text = one_line(error)[:120]
         raise InputError(f'{file}: its pixels cannot be read ({text}); copy or export it again, uncompressed') from None

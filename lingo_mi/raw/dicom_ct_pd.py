@@ -30,7 +30,7 @@ from lingo_mi.geometry.trajectories import scanner_rays
 from lingo_mi.raw.dicom_header import floats, needed
 from lingo_mi.raw.recording import Taken
 
-# Type of the stored value, and tag. Files whose types are not said store bytes.
+# Type of the stored value, and tag. Files without types store bytes.
 ATTRIBUTES = {
     'NumberofDetectorRows': ('H', 0x70291010),
     'NumberofDetectorColumns': ('H', 0x70291011),

@@ -30,7 +30,7 @@ _NAMED = {
     'ImagerPixelSpacing': 'ImagerPixelSpacing (0018,1164)',
 }
 _TOWARDS = dict(R=(1, 0, 0), L=(-1, 0, 0), A=(0, 1, 0), P=(0, -1, 0), H=(0, 0, 1), F=(0, 0, -1))
-_FEW = 1e-6  # mm and degrees, of what is one number in all files
+_FEW = 1e-6  # mm and degrees, for numbers that are the same in all files
 
 
 @dataclass(frozen=True)

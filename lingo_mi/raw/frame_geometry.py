@@ -171,7 +171,7 @@ def cropped(geometry: Geometry, crop: tuple[int, int, int, int]) -> Geometry:
         return replace(geometry, nDetector=pixels, offDetector=offset)
     curved = isinstance(geometry, CurvedGeometry)
     rays = geometry.flat.rays() if curved else geometry.rays()
-    left = (nu - pixels[1]) / 2 if curved else u0  # the middle of an arc stays, and goes along the arc then
+    left = (nu - pixels[1]) / 2 if curved else u0  # an arc keeps its middle here, which then moves along it
     rays = replace(rays, corner=rays.corner + left * rays.u + v0 * rays.v)
     if not curved:
         return Geometry.from_poses(rays, pixels, grid=geometry.grid)

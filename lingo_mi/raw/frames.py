@@ -80,7 +80,7 @@ def _image(path):
 
 def _rtk_image(path):
     itk = optional('itk', 'reference')
-    if not hasattr(itk, 'RTK'):  # to ask for it loads it, and it tells ITK of its formats
+    if not hasattr(itk, 'RTK'):  # asking for RTK loads it, and ITK learns its formats
         raise InputError(f"{path}: needs RTK: pip install '.[reference]' in a checkout of lingo_mi")
     return np.asarray(itk.imread(str(path)))
 

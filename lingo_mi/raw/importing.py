@@ -23,10 +23,10 @@ from lingo_mi.raw.options import Options, chosen_views, exposures, region_of
 from lingo_mi.raw.rings import require_enough, ring_offsets
 from lingo_mi.scan import Scan
 
-BELOW = -0.1  # a line integral that noise does not explain: 10 % more counts than the flat
-OFTEN = 0.02  # in this part of a view's pixels
-DARK = 0.005  # of the light of the other views: what a closed shutter leaves
-CLIPPED = 1e-3  # part of a view's pixels with the same highest count
+BELOW = -0.1  # lower line integrals, 10 % more counts than the flat, are not noise ...
+OFTEN = 0.02  # ... in more than this part of a view's pixels
+DARK = 0.005  # part of the other views' light: a closed shutter leaves less
+CLIPPED = 1e-3  # if more of a view's pixels have the same highest count, they are saturated
 
 
 class Imported(NamedTuple):

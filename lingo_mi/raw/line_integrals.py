@@ -16,13 +16,13 @@ from scipy.ndimage import median_filter, rank_filter
 from lingo_mi.common.errors import InputError
 from lingo_mi.raw.recording import Frames
 
-DEAD = 0.5  # a pixel whose gain is this part from its neighbours' is bad
+DEAD = 0.5  # a pixel is bad if its gain differs from its neighbours' by this part
 DIFFERENCE = (1, -4, 6, -4, 1)
-MOST_VIEWS = 64  # whose noise is measured
-FULL = 0.9  # a flat with more of its pixels saturated is none
-UNLIKE = 0.5  # a flat below this part of the others' brightness, or above its inverse, is none
-OUTLIER, BRIGHTER = 8.0, 1.1  # standard deviations and times by which an outlier is brighter than its neighbours
-HOT = 0.05  # and one whose dark count is that part of the flat's counts off its neighbours'
+MOST_VIEWS = 64  # most views whose noise is measured
+FULL = 0.9  # a flat with more of its pixels saturated is not usable
+UNLIKE = 0.5  # a flat below this part of the others' brightness, or above its inverse, is not a flat
+OUTLIER, BRIGHTER = 8.0, 1.1  # an outlier is brighter than its neighbours by so many standard deviations, and times
+HOT = 0.05  # a pixel is bad if its dark count is this part of the flat's counts off its neighbours'
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from scipy.signal import savgol_filter
 from lingo_mi.common.errors import InputError
 
 WINDOW, DEGREE = 21, 4  # columns of the curve, and its degree
-PASSES = 3  # each finds part of what the neighbours' offsets hid from the last
+PASSES = 3  # each finds part of the offsets that neighbours hid from the last
 MOST_PIXELS = 2**26  # of all views, in memory at a time: 256 MB
 LEAST_VIEWS = 25  # fewer leave so much of the object in the median that a sound chest changes by more than its noise
 LEAST_COLUMNS = 256  # on fewer, a body's details are as narrow as the curve: a chest on 192 columns loses 0.8 dB
@@ -46,7 +46,7 @@ def ring_offsets(projections: np.ndarray, valid: np.ndarray | None = None) -> np
     step = max(1, MOST_PIXELS // (n * columns))
     for first in range(0, rows, step):
         some = slice(first, first + step)
-        block = np.asarray(projections[:, some])  # of an array in chunks, all are read for it
+        block = np.asarray(projections[:, some])  # an array in chunks is read whole for it
         for k in range(block.shape[1]):
             inside = None if valid is None else valid[:, first + k]
             offsets[first + k] = _of_row(block[:, k].astype(float), inside)

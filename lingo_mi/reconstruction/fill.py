@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from lingo_mi.scan import Scan
 
-NOWHERE = np.inf  # the distance of pixels where there are none
+NOWHERE = np.inf  # distance to valid pixels if there are none
 
 
 def filled(scan: Scan) -> Scan:
@@ -40,7 +40,7 @@ def filled(scan: Scan) -> Scan:
         a, b = 1 / apart, 1 / (moves * views_apart)
         alone[:, row] = ~valid_row & (a + b == 0)
         p[:, row] = np.where(valid_row, values, (a * along + b * over) / np.maximum(a + b, 1e-12))
-    if alone.any():  # no valid pixel in the row, nor in other views: the nearest
+    if alone.any():  # no valid pixel in the row, nor in other views: take the nearest
         nearest = np.asarray(ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True))
         p[alone] = scan.projections[tuple(nearest)][alone]
     count = int((~valid).sum())

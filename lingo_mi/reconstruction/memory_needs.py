@@ -21,7 +21,7 @@ class Need(NamedTuple):
     projections: float
 
 
-NEEDS = {  # by the algorithms' names
+NEEDS = {  # by name of the algorithm
     'fdk': Need(3.4, 3.4, 1.5),
     'sart': Need(4.6, 8.7, 4.2),
     'os-sart': Need(3.7, 7.7, 4.8),

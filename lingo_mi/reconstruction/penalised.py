@@ -26,7 +26,7 @@ from lingo_mi.reconstruction.system import System, dot, evaluated, scalar
 from lingo_mi.reconstruction.voxel_values import means
 from lingo_mi.scan import Scan
 
-ACCURACY, SAFE = 1e-2, 1.02  # of the norm of A, and the factor on its square that makes up for what it lacks
+ACCURACY, SAFE = 1e-2, 1.02  # accuracy of the norm of A; factor on its square that makes up for the inaccuracy
 PATH = 1e-2, 3e-3, 1e-3, 3e-4, 1e-4, 3e-5  # strengths to choose from
 FIRST, MOST = 2, 5  # which of them is tried first; how many trials at most
 TRIED = 30  # iterations for each of them; each goes on from the volume of the one before
@@ -136,7 +136,8 @@ class PenalisedLeastSquares(Algorithm):
                 progress(steps if k == self.niter else done + k, steps, residuals[-1])
 
         x = solver.minimise(x, strength, self.niter, after_step)
-        residuals = [*residuals[:1], *residuals[2:], solver.system.residual(x)[1]]  # a step knows that where it began
+        # A step gives the residual of the volume that it starts from.
+        residuals = [*residuals[:1], *residuals[2:], solver.system.residual(x)[1]]
         volume = means(solver.system.volume(x), self.finer) if self.finer > 1 else solver.system.volume(x)
         return Reconstruction(volume, residuals, time.perf_counter() - began, grid)
 

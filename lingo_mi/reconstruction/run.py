@@ -28,8 +28,8 @@ from lingo_mi.reconstruction.slab_volume import discard, work_folder
 from lingo_mi.scan import Scan
 from lingo_mi.scene.checks import check_memory
 
-InSlabs = FDK | Sweeps | ASDPOCS  # what need not hold the whole volume
-MOST_ENTRIES = 2**32  # of one of Dr.Jit's arrays
+InSlabs = FDK | Sweeps | ASDPOCS  # these need not hold the whole volume
+MOST_ENTRIES = 2**32  # of an array of Dr.Jit
 
 
 def run_algorithm(

@@ -21,7 +21,7 @@ from lingo_mi.storage.file_access import leftovers, read_json, reading, write_te
 
 STATE = 'state.json'
 FILES = 'even.f32', 'odd.f32', 'third.f32', 'fourth.f32'
-PLANES = '.planes'  # ending of the file that holds the outer slices of the slabs of another one
+PLANES = '.planes'  # ending of the file that holds the outer slices of another file's slabs
 EXCHANGE = 'exchange'  # folder of what the workers of a cluster read and write besides the volume
 WORKERS = EXCHANGE, GROWING  # their folders
 

@@ -11,9 +11,8 @@ import numpy as np
 from scipy import ndimage
 
 CUBE = 1 / 8, 3 / 4, 1 / 8
-STEPS = (
-    2  # of Van Cittert's iteration. The inverse of B predicts views no better, and makes noise up to 8 times as large
-)
+# Of Van Cittert's iteration. The inverse of B predicts views no better, and makes noise up to 8 times as large.
+STEPS = 2
 
 
 def means(volume: np.ndarray, finer: int) -> np.ndarray:

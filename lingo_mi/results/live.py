@@ -28,7 +28,7 @@ from lingo_mi.report.data import ReportData
 from lingo_mi.report.packing import Arrays, preview
 from lingo_mi.report.payload import colour_maps, history, payload
 
-SHARE = 0.015  # of the fit's processor time, that a page may take until the end, whose state is shown in any case
+SHARE = 0.015  # part of the fit's processor time that a page may take; the state at the end is shown in any case
 MOST_VOXELS = 128**3  # of a volume in the page
 MILLISECONDS = 1000  # between two questions of the page
 MOST_ENTRIES = 2000  # of the history
@@ -51,12 +51,12 @@ class Live:
         self._token = secrets.token_urlsafe(24)
         self._lock = threading.Lock()
         self._history: list[dict] = []
-        self._thinned = 0  # how often the history was
+        self._thinned = 0  # how often the history was thinned
         self._line, self._number, self._done, self._end_seen = 'The fit begins.', 0, False, threading.Event()
         self._data: ReportData | None = None
         self._waiting: Fit | None = None  # the latest, until it is shown
         self._packed: tuple[int, dict, Arrays] = 0, {}, Arrays()
-        self._changed: dict[str, int] = {}  # the state that brought each array as it is
+        self._changed: dict[str, int] = {}  # number of the state that last changed each array
         self._packing = threading.Lock()
         self._truth: tuple[np.ndarray, np.ndarray] | None = None  # as given, and smaller
         self._began, self._spent, self._latest, self._asked = time.process_time(), 0.0, 0.0, -np.inf
@@ -97,7 +97,7 @@ class Live:
         parts.append(f'{clock(left)} left' if entry['iteration'] < total else f'done in {clock(entry["seconds"])}')
         with self._lock:
             self._history += history([entry])
-            if len(self._history) > MOST_ENTRIES:  # every second one of the earlier half, but for what was measured
+            if len(self._history) > MOST_ENTRIES:  # drop every second entry of the earlier half, except measured ones
                 half = self._history[: MOST_ENTRIES // 2]
                 thinned = [e for i, e in enumerate(half) if i % 2 or 'psnr_2d' in e or 'psnr_3d' in e]
                 self._history[: MOST_ENTRIES // 2] = thinned
@@ -121,7 +121,7 @@ class Live:
         return time.perf_counter() - self._asked < PATIENCE
 
     def _show(self, fit: Fit) -> None:
-        began, self._waiting = time.process_time(), None  # of all threads: Dr.Jit's threads make the volume
+        began, self._waiting = time.process_time(), None  # processor time counts all threads: Dr.Jit's make the volume
         data = self._contents(fit)
         with self._lock:
             self._data, self._number = data, self._number + 1

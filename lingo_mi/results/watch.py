@@ -73,7 +73,7 @@ class Watch:
         for watcher in [*self.watchers]:
             try:
                 tell(watcher)
-            except Exception as error:  # of a server, a disk: the fit is worth more than a look at it
+            except Exception as error:  # a server or a disk may fail: the fit is worth more than a look at it
                 self.watchers.remove(watcher)
                 warnings.warn(
                     f'{type(watcher).__name__} has failed ({brief(error, 150)}); the fit goes on', stacklevel=2

@@ -27,7 +27,7 @@ def data_file(name: str, parameter: str) -> str:
     resolver: Any = mi.file_resolver  # declared as an object
     path = Path(str(resolver().resolve(name)))
     folder = os.environ.get('LINGO_MI_DATA')
-    if not os.path.exists(path) and folder:  # other than Path's, False for a name that is too long
+    if not os.path.exists(path) and folder:  # unlike Path's method, this is False for a name that is too long
         path = Path(folder) / name
     if not os.path.exists(path):
         where = f'nor in LINGO_MI_DATA = {folder}' if folder else 'and LINGO_MI_DATA is not set'

@@ -28,7 +28,7 @@ def scene_path(scene: PathLike | str) -> Path:
         If there is neither. A folder of another name is returned unchanged; reading it fails later.
     """
     path = Path(scene)
-    if os.path.isfile(path):  # other than Path's, False for a name that is too long
+    if os.path.isfile(path):  # unlike Path's method, this is False for a name that is too long
         return path
     shipped = scenes()
     if str(scene) in shipped:

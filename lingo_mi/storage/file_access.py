@@ -51,7 +51,7 @@ def reading(path: PathLike | str, folder: bool = False) -> Iterator[None]:
     except FileNotFoundError as error:
         raise InputError(f'{error.filename or path}: there is no such file; check the path') from None
     except OSError as error:
-        if error.errno is None:  # not the system's, but a format's
+        if error.errno is None:  # raised by a format, not by the system
             raise InputError(f'{path}: is damaged ({one_line(error)}); fetch it or write it again') from None
         raise InputError(
             f'{error.filename or path}: cannot be read ({error.strerror}); check the path and its permissions'
@@ -179,7 +179,7 @@ def flush_folder(path: PathLike | str) -> None:
     try:
         os.fsync(folder)
     except OSError as error:
-        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EBADF):  # some file systems cannot
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP, errno.EBADF):  # some file systems cannot do it
             raise
     finally:
         os.close(folder)

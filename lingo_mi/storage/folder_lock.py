@@ -147,7 +147,7 @@ def _alive(owner: dict) -> bool:
         return True
     try:
         return psutil.pid_exists(owner['pid'])
-    except OverflowError:  # no number of a process
+    except OverflowError:  # not the number of a process
         return False
 
 

@@ -36,7 +36,7 @@ def main() -> None:
     p.add_argument('--rays', type=int, default=1024)
     p.add_argument('--samples', type=int, default=192)
     p.add_argument('--repeats', type=int, default=5, help='turns')
-    p.add_argument('--variant', help='of Mitsuba')
+    p.add_argument('--variant', help='Mitsuba variant')
     args = p.parse_args()
     variant = use_variant(args.variant)
     results = measured(args.rays, args.samples, args.repeats)

@@ -34,7 +34,7 @@ def main() -> None:
     p.add_argument('--gaussians', type=int, default=20_000)
     p.add_argument('--pixels', type=int, default=256, help='rows and columns of the panel')
     p.add_argument('--repeats', type=int, default=20, help='turns')
-    p.add_argument('--variant', help='of Mitsuba')
+    p.add_argument('--variant', help='Mitsuba variant')
     args = p.parse_args()
     variant = use_variant(args.variant)
     native, torch = measured(args.gaussians, args.pixels, args.repeats)

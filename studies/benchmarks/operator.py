@@ -235,7 +235,7 @@ def main() -> None:
     p.add_argument('--only', nargs='+', choices=list(OPERATORS), default=list(OPERATORS), help='operators')
     p.add_argument('--out', type=Path, help='a folder, for operator.csv and its provenance')
     p.add_argument(
-        '--overhead', action='store_true', help='of a call over its kernel, on a small scan, in place of the table'
+        '--overhead', action='store_true', help='measure a call over its kernel, on a small scan, in place of the table'
     )
     args = p.parse_args()
     use_variant()

@@ -83,7 +83,7 @@ def expected(gaussians: int) -> dict[str, float]:
 
 def main() -> None:
     p = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
-    p.add_argument('checkpoint', help='of a fit')
+    p.add_argument('checkpoint', help='checkpoint of a fit')
     p.add_argument('--repeats', type=int, default=100, help='steps in a row')
     p.add_argument('--variant', metavar='V')
     args = p.parse_args()

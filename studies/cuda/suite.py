@@ -18,7 +18,7 @@ from pathlib import Path
 from studies.cell_files import CellFiles
 from studies.cuda.assemble import Kernel, assemble
 
-# Of every part that computes on the device, what takes few minutes.
+# Tests of every part that computes on the device, which take few minutes.
 SHARE = (
     'projectors/test_balance.py',
     'projectors/test_splat.py',

@@ -71,7 +71,7 @@ def of_a_step(program: str, checkpoint: str) -> dict[str, int]:
 def main() -> None:
     p = argparse.ArgumentParser(description=(__doc__ or '').partition('\n')[0])
     p.add_argument('program', metavar='PROGRAM')
-    p.add_argument('checkpoint', type=Path, help='of a fit')
+    p.add_argument('checkpoint', type=Path, help='checkpoint of a fit')
     args = p.parse_args()
     try:
         waits = of_a_step(args.program, str(args.checkpoint))

@@ -22,7 +22,7 @@ from studies.command import run_study
 def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument(
-        '--only', nargs='+', metavar='NAME', help='these effects, by the names of their scenes (default: all)'
+        '--only', nargs='+', metavar='NAME', help='effects to measure, by the names of their scenes (default: all)'
     )
     p.add_argument('--out', type=Path, default=Path('out/effects'), metavar='D', help='folder of the results')
     docs_arguments(p, 'effects.md', 'figures/effects')

@@ -31,7 +31,7 @@ def arguments() -> argparse.Namespace:
     p.add_argument(
         '--with-cloud',
         action='store_true',
-        help='instead: corrections that fits of the method fast find with the cloud',
+        help='show instead the corrections that fits of the method fast find with the cloud',
     )
     p.add_argument(
         '--correct',
@@ -40,7 +40,7 @@ def arguments() -> argparse.Namespace:
         metavar='KIND',
         help=f'what to seek beside the axis and the turn of the panel: {", ".join(KINDS)} (default: all)',
     )
-    p.add_argument('--iterations', type=int, metavar='N', help="of these fits (default: the method's)")
+    p.add_argument('--iterations', type=int, metavar='N', help="iterations of these fits (default: the method's)")
     p.add_argument(
         '--out',
         type=Path,

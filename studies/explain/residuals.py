@@ -34,8 +34,8 @@ from lingo_mi.validation.provenance import write_provenance
 from studies.cell_files import CellFiles
 
 DRIFT = 3
-# What a row adds -> what the names of its numbers begin with.
 AIR = 'air level'
+# What a row adds -> how the names of its numbers begin.
 ROWS = {
     'as given': (),
     'axis and turn of the panel': ('u', 'yaw'),
@@ -46,7 +46,7 @@ ROWS = {
     'scatter': ('scatter',),
 }
 NOTHING = 'no error of measurement (simulated)'
-# Corrections that a fit finds with the cloud, beside the corrections of the rows above.
+# Corrections that a fit finds with the cloud, besides those of the rows above.
 WITH_CLOUD = {
     'as given': {},
     'air level of every view': dict(fit_air='view'),

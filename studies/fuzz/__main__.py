@@ -22,13 +22,13 @@ from studies.command import run_study
 
 def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument('--readers', nargs='+', metavar='NAME', help='which ones (default: all)')
-    p.add_argument('--cases', type=int, default=200, metavar='N', help='for every reader (default 200)')
-    p.add_argument('--total', type=int, metavar='N', help='for all readers together, instead')
+    p.add_argument('--readers', nargs='+', metavar='NAME', help='readers to test (default: all)')
+    p.add_argument('--cases', type=int, default=200, metavar='N', help='cases for every reader (default 200)')
+    p.add_argument('--total', type=int, metavar='N', help='cases for all readers together, instead')
     p.add_argument('--seed', type=int, default=0)
     p.add_argument('--processes', type=int, default=2, metavar='N', help='children at a time (default 2)')
-    p.add_argument('--seconds', type=float, default=10.0, metavar='S', help='that a case may take (default 10)')
-    p.add_argument('--memory', type=float, default=1.0, metavar='GIB', help='that a child may take (default 1)')
+    p.add_argument('--seconds', type=float, default=10.0, metavar='S', help='seconds that a case may take (default 10)')
+    p.add_argument('--memory', type=float, default=1.0, metavar='GIB', help='GiB that a child may take (default 1)')
     p.add_argument('--out', type=Path, default=Path('out/fuzz'), metavar='DIR', help='where cases that fail are saved')
     p.add_argument('--markdown', type=Path, metavar='F', help='write the page there, too')
     return p.parse_args()

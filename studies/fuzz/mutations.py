@@ -42,7 +42,7 @@ def mutated(original: bytes | Structured, name: str, rng: Random) -> bytes:
                 data = _data(data, rng)
             try:
                 return original.dump(data)
-            except Exception:  # what the format cannot hold
+            except Exception:  # the format cannot hold the value
                 pass
         original = original.content()
     if rng.random() < 0.5:

@@ -79,7 +79,7 @@ class _Child:
     def stop(self, hangs: bool = True) -> int:
         """Ends the process; returns its exit code."""
         try:
-            code = self.process.wait(0 if hangs else 5)  # what it died of
+            code = self.process.wait(0 if hangs else 5)  # how it died
         except subprocess.TimeoutExpired:
             self.process.kill()
             code = self.process.wait()

@@ -43,7 +43,7 @@ def draw(measured: list[dict], path: Path) -> None:
             numbers = [row['number'] for row in rows]
             for line, (key, unit) in enumerate((('seconds', 1), ('peak', 1e9))):
                 values = [max(row[key] / unit, 1e-3) for row in rows]
-                # Small arrays hide in what a process has at hand: their memory follows no law.
+                # Small arrays fit into memory that a process has already: their memory follows no law.
                 label = f'{stage}: {exponent(rows, key):.2f}' if key == 'seconds' else stage
                 axes[line, column].loglog(numbers, values, 'o-', color=f'C{i}', label=label, markersize=4)
         axes[1, column].set_xlabel(axis)

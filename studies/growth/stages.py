@@ -21,7 +21,7 @@ import numpy as np
 
 TINY = 16, 16, 4, 100
 AXES = 'voxels', 'pixels', 'views', 'Gaussians'
-# What each stage's cost depends on; the others are passed over.
+# Sizes that each stage's cost depends on; the others are skipped.
 DEPENDS = {
     'initialise': AXES,
     'step': ('pixels', 'Gaussians'),

@@ -28,7 +28,7 @@ def arguments() -> argparse.Namespace:
     p.add_argument('--markdown', type=Path, metavar='F', help='write the table there, too')
     p.add_argument('--json', type=Path, metavar='F', help='write all numbers there, for --beside')
     p.add_argument('--beside', type=Path, metavar='F', help="show another variant's results in columns of their own")
-    p.add_argument('--steps', type=int, default=10_000, metavar='N', help='of the long fit (default: 10000)')
+    p.add_argument('--steps', type=int, default=10_000, metavar='N', help='steps of the long fit (default: 10000)')
     p.add_argument(
         '--without', nargs='+', default=[], metavar='TEXT', help='leave out the cases whose names contain one of these'
     )

@@ -229,7 +229,7 @@ def _geometries():
         for shift in (1e4, 1e6):
             rays, shape = scanner(mode)
             shift = np.array([2.0, -1.4, 0.9]) * shift
-            # Float32 names places this far out only to a thousandth of the scene: what counts is where they are.
+            # Float32 names places this far out only to a thousandth of the scene, so the rounded places count.
             size = cloud.changed(centre=cloud.centre + shift)
             moved = Rays(
                 rays.source + (0 if rays.parallel else shift), rays.corner + shift, rays.u, rays.v, rays.parallel

@@ -23,13 +23,18 @@ def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--objects', nargs='+', default=['foot', 'chest'], metavar='NAME', help='(default: foot chest)')
     p.add_argument(
-        '--photons', nargs='+', type=float, default=[1e3, 1e4, 1e5], metavar='N', help='a pixel (default: 1e3 1e4 1e5)'
+        '--photons',
+        nargs='+',
+        type=float,
+        default=[1e3, 1e4, 1e5],
+        metavar='N',
+        help='photons a pixel (default: 1e3 1e4 1e5)',
     )
     p.add_argument('--finer', nargs='+', type=int, default=[2], metavar='N', help='(default: 2)')
     p.add_argument('--views', type=int, default=25, metavar='N', help='(default: 25)')
     p.add_argument('--settings', nargs='+', metavar='NAME', help='some of equal, stopped, noise (default: all)')
     p.add_argument('--size', type=int, default=64, help='voxels along the longest side (default: 64)')
-    p.add_argument('--pixels', type=int, default=64, help='of the panel, a side (default: 64)')
+    p.add_argument('--pixels', type=int, default=64, help='pixels along a side of the panel (default: 64)')
     p.add_argument('--iterations', type=int, metavar='N', help="steps of a fit, at most (default: the method's)")
     p.add_argument('--out', type=Path, default=Path('out/noise'), help='folder of the results')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')

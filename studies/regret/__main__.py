@@ -24,10 +24,10 @@ from studies.command import run_study, updated_table
 def arguments() -> argparse.Namespace:
     p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument('--objects', nargs='+', default=['foot', 'chest'], metavar='NAME', help='(default: foot chest)')
-    p.add_argument('--finer', nargs='+', type=int, metavar='N', help='(default: 1 2; of measured scans 1)')
+    p.add_argument('--finer', nargs='+', type=int, metavar='N', help='(default: 1 2; for measured scans 1)')
     p.add_argument('--views', nargs='+', type=int, default=[25], metavar='N', help='(default: 25)')
     p.add_argument(
-        '--photons', nargs='+', type=float, default=[0.0], metavar='N', help='a pixel (default: 0, no noise)'
+        '--photons', nargs='+', type=float, default=[0.0], metavar='N', help='photons a pixel (default: 0, no noise)'
     )
     p.add_argument('--size', type=int, default=48, help='voxels along the longest side (default: 48)')
     p.add_argument('--clouds', action='store_true', help='also the settings that need a fitted cloud')

@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 VARIES = ('off', 'smooth', 'view')  # how air and gain change from view to view
-SMOOTH = 3  # degree in time of what is smooth
-SURE = 3.0  # standard errors from which a number is taken for real
+SMOOTH = 3  # degree in time of smooth air and gain
+SURE = 3.0  # a number counts if it is so many standard errors from 0
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,9 @@ from scipy.ndimage import median_filter
 
 from lingo_mi.calibration.response.part import ResponsePart
 
-SMOOTH = 9  # pixels: the side of the squares whose median is left to the object
+SMOOTH = 9  # side in pixels of squares: their median is left to the object
 MEDIAN = 1.4826 * 1.2533  # times the median deviation over the root of n: the standard error of a median
-SURE = 3.0  # standard errors below which an offset is taken for none
+SURE = 3.0  # an offset of fewer standard errors counts as 0
 
 
 @dataclass
@@ -48,7 +48,7 @@ class Pixels(ResponsePart):
         residual = measured.astype(float) - expected
         if valid is not None:
             residual = np.where(valid, residual, np.nan)
-            residual[:, ~valid.any(0)] = 0  # a median of nothing
+            residual[:, ~valid.any(0)] = 0  # no view has a value to take the median of
         middle = np.nanmedian(residual, 0)
         size = np.minimum(SMOOTH, self.shape)
         offset = middle - median_filter(middle, tuple(size), mode='nearest')

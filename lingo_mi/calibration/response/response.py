@@ -17,7 +17,7 @@ from lingo_mi.calibration.response.scatter import ScatterImage
 from lingo_mi.geometry.base import Geometry
 
 STEPS = 4  # of Gauss and Newton
-SAMPLES = 400_000  # pixels of all views that are looked at
+SAMPLES = 400_000  # pixels that are used, of all views together
 ROBUST = 3.0  # median deviations beyond which a pixel counts less (Huber)
 
 
@@ -181,7 +181,7 @@ class Response:
             if deviation is None:
                 deviation = max(1.4826 * float(np.median(np.abs(r[use]))), 1e-6)
             weight = use * np.minimum(1, ROBUST * deviation / np.maximum(np.abs(r), 1e-12))
-            # The view's own derivatives, then by what its numbers are made of.
+            # Derivatives by the view's own numbers, then by the numbers that these are made of.
             by_view = np.array([a.ravel() for slopes in columns for a in slopes])
             to = np.zeros((len(by_view), starts[-1]))
             k = 0

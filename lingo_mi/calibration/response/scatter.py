@@ -16,7 +16,7 @@ from lingo_mi.calibration.response.part import SURE, Place, ResponsePart
 
 DEGREE = 2
 ORDERS = [(i, j) for i in range(DEGREE + 1) for j in range(DEGREE + 1 - i)]
-LEAST_LIGHT = 0.1  # of what is measured is not scatter
+LEAST_LIGHT = 0.1  # least part of the measured light that is not scatter
 EVERYWHERE = Place(*np.meshgrid(*2 * [np.linspace(-1, 1, 41)], indexing='ij'))
 
 

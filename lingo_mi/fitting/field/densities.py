@@ -11,9 +11,9 @@ from lingo_mi.reconstruction.rectify import can_rectify
 from lingo_mi.reconstruction.run import run_algorithm
 from lingo_mi.scan import Scan
 
-SHARE, ROOM = 0.9999, 1.5  # of the voxels of an FDK volume that are less dense; the bound, over the next
+SHARE, ROOM = 0.9999, 1.5  # part of an FDK volume's voxels below some density; the bound over that density
 THINNEST = 0.1  # way through the densest matter, in halves of the volume's longest side, if there is no FDK volume
-VIEWS = 8  # that a mean is taken over, at most
+VIEWS = 8  # most views that a mean is taken over
 
 
 def largest_density(scan: Scan) -> float:

@@ -19,7 +19,7 @@ from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.projectors.grid import view_table
 from lingo_mi.projectors.upload import uploaded
 
-POINTS = 2**18  # of the field that are evaluated at once
+POINTS = 2**18  # points of the field that are evaluated at once
 
 
 class FieldModel(Model):

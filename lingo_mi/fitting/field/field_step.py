@@ -38,7 +38,7 @@ class FieldStepper(Stepper):
 
     def begin(self, seed: int) -> tuple[State, np.ndarray, dict]:
         """Random parameters, and no points."""
-        rng = np.random.default_rng(seed).spawn(1)[0]  # takes nothing from the steps
+        rng = np.random.default_rng(seed).spawn(1)[0]  # leaves the steps' random numbers as they are
         mean = mean_density(self.scan) / self.model.unit if self.options.field_start == 'mean' else None
         values = self.model.network.initial(rng, mean)
         first, second = ({k: np.zeros_like(v) for k, v in values.items()} for _ in range(2))

@@ -17,7 +17,7 @@ from typing_extensions import Self
 from lingo_mi.common.errors import InputError, shown
 from lingo_mi.common.parsing import checked, nearest, parse, require_ranges
 
-MOST_STEPS = 1e9  # ranges end where float32 or the time of a fit does, far beyond what is of use
+MOST_STEPS = 1e9  # ranges end far beyond useful values, at the limits of float32 or of the time of a fit
 
 
 @dataclass(frozen=True)

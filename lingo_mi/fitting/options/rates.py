@@ -8,7 +8,7 @@ from typing import ClassVar
 from lingo_mi.fitting.options.part import MOST_STEPS, Part
 
 RATES = (1e-12, 1e3)
-DECAY = (0, 1 - 1e-6)  # float32 counts more as 1
+DECAY = (0, 1 - 1e-6)  # float32 rounds more to 1
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from lingo_mi.scan import Scan
 
 PASSES = 3  # of SART
 LARGEST = 128  # voxels along the longest side of its volume: an edge is sought, not its shape
-BLUR = 0.7  # standard deviation of the derivatives of a Gaussian that find edges, voxels
-INSIDE = 0.02  # what density counts for beside its gradient per voxel, so that even regions get points, too
+BLUR = 0.7  # standard deviation, in voxels, of the Gaussian whose derivatives find edges
+INSIDE = 0.02  # weight of the density beside its gradient per voxel, so that even regions get points, too
 EMPTY = 0.01  # part of the largest density below which a voxel gets none
 MOST_LOST = 0.1  # part of the edges that masks may cut off; masks that cut off more are wrong about the object
 

@@ -25,7 +25,7 @@ from lingo_mi.validation.accuracy.sizes import FULL, Sizes
 from lingo_mi.validation.accuracy.tables import FIELD as COLUMNS
 from lingo_mi.validation.markdown import table
 
-FINE = 16  # times as many samples as the most that are measured, as the truth
+FINE = 16  # the truth has so many times the samples of the largest measurement
 # A cube that is the volume, and levels of 16 to 128 cells along its side: as fine as voxels of a fit.
 FIELD = Field(field_cube=1.0, field_levels=4, field_growth=2.0)
 AMPLITUDE = 4.0  # of random features: the densities then spread over the whole of (0, 1)

@@ -29,7 +29,7 @@ TITLES = dict(
     fits='Fits',
     field='Neural fields',
 )
-SHOWN = 'conditions', 'presets'  # what the page of the documentation shows; it links to the others as data
+SHOWN = 'conditions', 'presets'  # shown in the page of the documentation, which links to the others as data
 
 
 def make_tables(results: dict, beside: dict | None = None) -> dict[str, str]:

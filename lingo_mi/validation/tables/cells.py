@@ -48,11 +48,11 @@ from lingo_mi.validation.tables.photons import LARGEST, counting, noisy
 from lingo_mi.validation.tables.record import Record
 
 SCANNED, COMPLETED = 50, 100  # views of a scan; views that a CT volume is made of
-R2_ERROR = 0.15  # of asd-pocs-r2: the error of its views at which least total variation goes first, over their norm
-LATER = {'fit_pixels': 'off'}  # settings that came after published cells, and their values in those
+R2_ERROR = 0.15  # maxl2err of asd-pocs-r2, over the norm of its views
+LATER = {'fit_pixels': 'off'}  # settings that are newer than published cells, and their values in these
 NEW_VIEWS, CT = ('psnr_2d_r2', 'ssim_2d_r2', 'ipsd'), ('psnr_3d_r2', 'ssim_3d_r2')  # of a fit's views; of a volume
 
-# What each volume is made by, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults, and in
+# How each volume is made, and the passes over all views (R2-Gaussian's comparison; the rest are TIGRE's defaults, and in
 # sart-r2 and asd-pocs-r2 what R2-Gaussian has released).
 ALGORITHMS = {
     'fdk': FDK(),
@@ -117,7 +117,7 @@ class Scale:
 
 
 PAPER_SIZE = 256
-# An object of 3/8 of the size in every length has 1/7 of the surface, so as many of the Gaussians. V_S is made smaller, too, so
+# An object of 3/8 of the size in every length has 1/7 of the surface, and so 1/7 of the Gaussians. V_S is made smaller, too, so
 # that cells have the paper's size in parts of the object.
 SCALES = {
     'small': Scale(96, 192, 7000, (5000,), ('foot', 'chest', 'engine', 'aneurism')),
@@ -280,7 +280,7 @@ class Cells:
             for i, cell in enumerate(missing, 1):
                 try:
                     self.compute(cell, f'[{i}/{len(missing)}] {cell}')
-                except InputError as error:  # of one cell: the others are worth having
+                except InputError as error:  # one cell failed: the others are worth having
                     failed[cell] = error
                 after_each()
         except KeyboardInterrupt:

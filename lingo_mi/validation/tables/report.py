@@ -185,7 +185,7 @@ def _volume(views, method, iterations, algorithm):
     if method == 'none':
         return lambda name: Volume(Fit(name, views, 'none'), algorithm)
     if algorithm == 'best':
-        return lambda name: None  # it holds out measured views, which a cloud has seen
+        return lambda name: None  # `best` holds out measured views, which a cloud has seen
     fit = _fit(views, method, iterations)
     return fit if algorithm == 'voxelize' else lambda name: Volume(fit(name), algorithm)
 

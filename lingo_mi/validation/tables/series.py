@@ -82,7 +82,7 @@ def compute_series(
             if cells.get(cell) is None:
                 try:
                     cells.compute(cell, str(cell), lambda step: report(done + step))
-                except InputError as error:  # of one cell: the others are worth having
+                except InputError as error:  # one cell failed: the others are worth having
                     failed.append(error)
             done += steps_of(scale)(cell)
             report(done)
