@@ -98,7 +98,7 @@ class CTScanner(mi.Sensor):
             self.detector = next((f.detector for f in films.values() if hasattr(f, 'detector')), None)
             if len(films) > (self.detector is not None):
                 raise InputError(
-                    'the scanner makes its own film, of nDetector pixels: leave yours out, unless it is one ct_detector'
+                    'the scanner makes its own film, of nDetector pixels: leave yours out, unless it is a ct_detector'
                 )
             projections = parameter(props, 'projections', '')
             if projections:

@@ -76,7 +76,7 @@ def create(props: mi.Properties) -> mi.Object:
     if phantom and mu_water:
         raise InputError('ct_volume: mu_water is for a file in Hounsfield units; give a phantom attenuation = real')
     if filename and attenuation != 'x3d':
-        raise InputError('ct_volume: attenuation is of a phantom; a file in Hounsfield units takes mu_water')
+        raise InputError('ct_volume: attenuation is for a phantom; a file in Hounsfield units takes mu_water')
     if phantom:
         data = make(phantom, size, seed, attenuation).data
     else:

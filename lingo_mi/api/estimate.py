@@ -124,7 +124,7 @@ def _check_trial(scan: Scan | Geometry, work: Algorithm | Method, trial: Any, re
     if isinstance(scan, Geometry):
         raise InputError('a trial works on projections: give the scan, not its geometry alone')
     if isinstance(work, Refined):
-        raise InputError('refined starts from a fitted cloud, so that it cannot be tried: leave out trial')
+        raise InputError('refined starts from a fitted cloud, so it cannot be tried: leave out trial')
     if not result.fits:
         raise InputError(f'the trial does not fit into memory, {result!r}: lower nVoxel, nDetector or the views')
 

@@ -141,7 +141,7 @@ def reconstruct(
     path = None if out is None else as_path('out', out)
     start, unit = _start(start), unit_of(units, mu_water)
     if path is None and unit != PER_MM:
-        raise InputError(f'units={units!r} is for a file, the volume here is per mm: give out=FILE')
+        raise InputError(f'units={units!r} is for files, and a volume in memory is per mm: give out=FILE')
     _check(algorithm, start, views, path, slab)
     if path is not None:
         _check_output(path, algorithm, force, unit)

@@ -42,8 +42,8 @@ def facts(scan: Scan, findings: Findings) -> list[str]:
         lines.append('noise: none that could be measured')
     else:
         lines.append(
-            f'noise: {findings.photons**-0.5:.2g} rms in air from column to column, as from {findings.photons:.2g} photons a '
-            'pixel'
+            f'noise: {findings.photons**-0.5:.2g} rms in air from column to column, like that of {findings.photons:.2g} '
+            'photons a pixel'
         )
     if findings.clipped is not None:
         lines.append(
@@ -62,7 +62,7 @@ def _orbit(scan, findings):
     if orbit.turn and len(scan) >= 4:
         lines.append(f'angles: {np.degrees(orbit.turn):.4g} degrees in all')
     if orbit.obstacle is not None:
-        lines.append(f'consistency of the views: not measured, as {OBSTACLES[orbit.obstacle]}')
+        lines.append(f'consistency of the views: not measured, because {OBSTACLES[orbit.obstacle]}')
     if orbit.disagreement is None:
         return lines
     what = 'of the half-width of the panel' if scan.geometry.mode == 'parallel' else 'of their mass'
@@ -73,7 +73,7 @@ def _orbit(scan, findings):
             f'axis: {orbit.shift:+.3g} mm on the panel ({pixels:+.2g} pixels) lets them agree to {orbit.shifted:.2%}'
         )
     elif orbit.short and orbit.reversed is None and orbit.swapped is None:
-        lines.append('axis: not measured, as the views span less than half a turn')
+        lines.append('axis: not measured, because the views span less than half a turn')
     return lines
 
 
@@ -83,7 +83,7 @@ def advice(scan: Scan, findings: Findings) -> list[str]:
     if findings.text_order is not None:
         lines.append(
             'the views are sorted by their names as text, 10 before 2: sort them by number, as lingo-mi import does with frames; '
-            'what is said here of views is of that order'
+            'the findings about views hold for the order by text'
         )
     if findings.dead_columns:
         lines.append(
@@ -113,7 +113,7 @@ def advice(scan: Scan, findings: Findings) -> list[str]:
     if findings.clipped is not None:
         lines.append('pixels are clipped at the highest value: mark them in the mask `valid` (photon starvation)')
     if findings.black:
-        lines.append(f'{_named(findings.black)} black or empty: drop with --views of import, or lm.Scan.subset')
+        lines.append(f'{_named(findings.black)} black or empty: drop by --views of import, or by lm.Scan.subset')
     if findings.doubled:
         lines.append(
             f'{_named(findings.doubled)} the same as the one before: drop it, or correct the angles (a frame was stored twice)'

@@ -113,7 +113,7 @@ def _check_header(path: Path, header: list[str]) -> None:
         if not name:
             raise InputError(f'{path}: column {header.index(name) + 1} has no name')
         if header.count(name) > 1:
-            raise InputError(f'{path}: has {header.count(name)} columns {shown(name)}; leave one')
+            raise InputError(f'{path}: has {header.count(name)} columns {shown(name)}; keep one')
 
 
 def _row(cells: dict[str, str], line: int, folder: Path, method: str) -> Row:

@@ -206,7 +206,7 @@ def require_whole(film: Any, where: str) -> None:
     """Raises InputError for a film with a crop window. where: whose it is, for the message."""
     if any(film.crop_size()[i] != film.size()[i] for i in (0, 1)):
         raise InputError(
-            f'{where}: has no crop window, since blur, gains, noise and scatter are of the whole panel; crop the image'
+            f'{where}: cannot have a crop window, since blur, gains, noise and scatter concern the whole panel; crop the image'
         )
 
 
@@ -229,7 +229,7 @@ def find_effects(scene: Any, sensor: Any) -> Effects | None:
             'radius of the panel'
         )
     if len(tubes) > 1:
-        raise InputError(f'the scene has {len(tubes)} emitters xray_tube: leave one')
+        raise InputError(f'the scene has {len(tubes)} emitters xray_tube: keep one')
     tube, spot, scatter = (tubes[0].tube, tubes[0].spot, tubes[0].scatter) if tubes else (None, None, None)
     shapes = {shape.id() for shape in scene.shapes()} | {'volume'}  # a scanned volume stands in for the shapes
     if tube is not None and (unknown := sorted(tube.materials.keys() - shapes)):

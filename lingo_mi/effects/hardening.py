@@ -152,7 +152,7 @@ class Tube:
         if len(names) > 2 or len(names) == 2 and self.split is None:
             raise InputError(
                 f'xray_tube: a fit tells two materials apart by their densities, not {" + ".join(names)}: '
-                + ('leave two of them' if len(names) > 2 else 'add a split, the densities in 1/mm between them')
+                + ('keep two of them' if len(names) > 2 else 'add a split, the densities in 1/mm between them')
                 + ", or leave it out with effects='ignore'"
             )
         if len(names) == 2 and names != self.material:

@@ -26,7 +26,7 @@ def numeric(array: np.ndarray, where: PathLike | str, ndim: int | None, finite: 
         raise InputError(f'{where}: holds {array.dtype} values; real numbers are needed')
     if ndim not in (None, array.ndim) or array.size == 0:
         of = '' if ndim is None else f' of {ndim} dimensions'
-        raise InputError(f'{where}: has the shape {array.shape}, but a filled array{of} is needed')
+        raise InputError(f'{where}: has the shape {array.shape}, but a non-empty array{of} is needed')
     if not finite or array.dtype.kind != 'f':
         return array
     if not np.isfinite(array).all():

@@ -122,7 +122,7 @@ def _opened(path: Path, name: str) -> Iterator[Any]:
             raise InputError(f'{path}: is damaged ({brief(error, 100)}); copy it again') from None
         if not inside:
             raise InputError(
-                f'{path}: has no dataset {name} in this file; name that of the projections in the geometry file, such as '
+                f'{path}: has no dataset {name} in this file; name the dataset of projections in the geometry file, such as '
                 'dataset: /entry/data'
             )
         yield data

@@ -1,7 +1,7 @@
 """NIfTI-1 and -2, .nii, .nii.gz and .hdr with .img, and Analyze: header and voxels.
 
 nibabel makes sense of the header's block and of the voxels, whose claims are checked in between. `nibabel.load` would unpack an
-extension of a gigabyte from a file of megabytes, reach no check sum, and read the .mat file beside an Analyze header.
+extension of a gigabyte from a file of megabytes, reach no checksum, and read the .mat file beside an Analyze header.
 """
 
 from __future__ import annotations

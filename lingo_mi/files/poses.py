@@ -67,7 +67,7 @@ def read_poses(
 
 def _needed(dDetector, path):
     if dDetector is None:
-        raise InputError(f'{path}: leaves the size of a pixel open; add dDetector')
+        raise InputError(f'{path}: does not say the size of a pixel; add dDetector')
     return dDetector
 
 

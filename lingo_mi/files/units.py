@@ -77,7 +77,7 @@ def unit_of(units: str, mu_water: float | None = None) -> Unit:
         return Unit(units)
     if mu_water is None:
         raise InputError(
-            "units='hu' needs the attenuation of water in 1/mm: give mu_water=0.0206, that at 60 keV, or yours"
+            "units='hu' needs the attenuation of water in 1/mm: give mu_water=0.0206, the value at 60 keV, or yours"
         )
     try:
         water = float(mu_water)

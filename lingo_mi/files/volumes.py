@@ -116,7 +116,7 @@ def _density(data, path, hu, mu_water, only_hu):
     keep = data.dtype.kind == 'f' and high <= 1
     if mu_water is not None and not keep:
         raise InputError(
-            f"{path}: its values, up to {high:g}, are not attenuation per mm, so that units='hu' cannot be written: leave out "
+            f"{path}: its values, up to {high:g}, are not attenuation per mm, so units='hu' cannot be written: leave out "
             'units and mu_water'
         )
     data = np.maximum(data.astype(np.float32), 0)

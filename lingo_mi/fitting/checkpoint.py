@@ -1,7 +1,7 @@
 """Checkpoints: all that a fit needs to continue exactly as without the interruption.
 
 A checkpoint is an uncompressed .npz of the entries that `checkpoint_schema` names and one more, `checksum`. It is made of the
-check sums that a zip archive keeps of its entries, which are compared in any case, so that it costs no time.
+checksums that a zip archive keeps of its entries, which are compared in any case, so that it costs no time.
 """
 
 from __future__ import annotations
@@ -197,14 +197,14 @@ def _text(array: np.ndarray) -> str:
 
 
 def _array(file: io.BufferedReader, entry: zipfile.ZipInfo) -> np.ndarray:
-    """The array in an entry, writable, from the file straight into its memory. Raises InputError if the entry's check sum is
+    """The array in an entry, writable, from the file straight into its memory. Raises InputError if the entry's checksum is
     wrong, or its header claims another size than it has, or objects."""
     file.seek(entry.header_offset + 26)  # the lengths of the parts before the content
     name, more = struct.unpack('<HH', file.read(4))
     file.seek(name + more, os.SEEK_CUR)
     content = bytearray(entry.file_size)
     if file.readinto(content) != len(content) or zlib.crc32(content) != entry.CRC:
-        raise InputError('the check sum of an entry is wrong')
+        raise InputError('the checksum of an entry is wrong')
     header = io.BytesIO(content[:LONGEST_HEADER])
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     try:
@@ -224,7 +224,7 @@ def checksum_of(sums: Iterable[tuple[str, int]]) -> str:
 
 
 class _Crc:
-    """A file that keeps nothing of what is written to it but the check sum."""
+    """A file that keeps nothing of what is written to it but the checksum."""
 
     def __init__(self):
         self.value = 0
@@ -234,7 +234,7 @@ class _Crc:
 
     @classmethod
     def of(cls, array: np.ndarray) -> int:
-        """The check sum that a zip archive has of an array's .npy."""
+        """The checksum that a zip archive has of an array's .npy."""
         file = cls()
         np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)
         return file.value

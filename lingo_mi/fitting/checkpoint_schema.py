@@ -61,7 +61,7 @@ def require_sound(arrays: dict[str, np.ndarray], plain: Any) -> tuple[Method, Ge
     if method.makes_gaussians:
         _require(min(counts) > 0, 'it holds no Gaussian')
     else:
-        _require(counts == (0, 0), 'it holds Gaussians, but it is of a neural field')
+        _require(counts == (0, 0), 'it holds Gaussians, but belongs to a neural field')
     order = arrays['array.order']
     _require(
         not len(order) or order.min() >= 0 and order.max() < views and len(np.unique(order)) == len(order),

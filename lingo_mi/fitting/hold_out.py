@@ -37,7 +37,7 @@ def with_held_out(scan: Scan | Dataset, every: int | None) -> Dataset:
         measured = scan is dataset and test is None and dataset.volume is None
         every = EVERY if measured and len(train) >= LEAST else 0
     elif whole_number('hold_out', every, 0) == 1:
-        raise InputError('hold_out=1 leaves no view to fit: give 0, or one view in so many from 2 on')
+        raise InputError('hold_out=1 leaves no view to fit: give 0, or N from 2 on to hold out one view in N')
     if not every:
         return dataset
     if test is not None:

@@ -36,7 +36,9 @@ def weights_of(scan: Scan, weights: str) -> np.ndarray | None:
     effects = effects_of(scan)
     detector = effects.detector if effects else None
     if not (detector and (detector.photons or detector.bits)):
-        raise InputError('weights=noise needs a ct_detector with photons or bits in the scene, or leave it out')
+        raise InputError(
+            'weights=noise needs a ct_detector with photons or bits in the scene: add one, or leave weights out'
+        )
     factors = np.empty_like(scan.projections)
     for i, p in enumerate(scan.projections):  # view by view, for memory
         valid = np.ones(p.shape) if scan.valid is None else scan.valid[i].astype(float)

@@ -180,14 +180,14 @@ class Method(Part, ABC):
         elif self.frees_views:
             why = 'cannot know their poses: take pose_motion=smooth'
         if stop == 'on' and why:
-            raise InputError(f'stop=on holds views out, and {why}, or leave it out')
+            raise InputError(f'stop=on holds views out, and {why}; else leave stop=on out')
         return stop == 'on' or stop == 'auto' and not why and knows_noise(scan)
 
     def require_batch(self) -> None:
         """Raise InputError if a step has one view, which workers cannot divide."""
         if self.batch == 1:
             raise InputError(
-                'cluster= divides the views of a step among workers, and a step has 1 view: set batch=N, or leave it out'
+                'cluster= divides the views of a step among workers, and a step has 1 view: set batch=N, or leave cluster out'
             )
 
     @property
@@ -277,7 +277,7 @@ class Stepper(ABC):
             If the steps cannot be divided.
         """
         raise InputError(
-            f'cluster= divides the views of Gaussians among workers, not those of {method.name}: leave it out'
+            f'cluster= divides the views of a fit of Gaussians among workers, but {method.name} has none: leave cluster out'
         )
 
     def densified(self, state: DeviceState, iteration: int, rng: np.random.Generator) -> DeviceState | None:

@@ -95,7 +95,7 @@ class GaussianStepper(Stepper):
         if self.corrections:
             raise InputError(
                 'cluster= divides the views of a step among workers, which cannot fit poses, air levels, gains, scattered light '
-                'or two materials as well: leave it out, or those'
+                'or two materials as well: leave out cluster, or these options'
             )
         if any(address.startswith('inproc:') for address in cluster.client.nthreads()):
             raise InputError(

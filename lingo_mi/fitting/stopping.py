@@ -72,4 +72,4 @@ def sentence(record: dict) -> str:
     best, last = record['best'], record['iterations'][-1]
     if best == last:
         return f'took all {best} steps: the held-out error fell to the end'
-    return f'stopped at step {best}: held-out error did not fall for {last - best} steps more'
+    return f'stopped at step {best}: held-out error did not fall for {last - best} more steps'

@@ -228,7 +228,7 @@ def _faults(source, corner, u, v, parallel) -> Iterator[tuple[str, Any]]:
     beam = source if parallel else corner - source
     length = np.linalg.norm(beam, axis=1)
     if parallel:
-        yield 'has a beam of no direction', ~(length > 0)
+        yield 'has a beam without a direction', ~(length > 0)
     along = np.abs(np.sum(beam * normal, 1))
     yield (
         'has a beam along its panel' if parallel else 'has its source in the plane of its panel',

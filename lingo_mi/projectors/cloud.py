@@ -117,7 +117,7 @@ class _LineIntegrals(dr.CustomOp):
         if (options.footprint == 'affine' or options.area) and dr.width(straddling):
             warnings.warn(
                 AccuracyWarning(
-                    f'{dr.width(straddling)} Gaussians reach to the source, or lie along rays: of them the '
+                    f'{dr.width(straddling)} Gaussians reach to the source, or lie along rays: for them the '
                     f'integral along the ray through the pixel\'s centre is taken, whatever "pixel" and "footprint" say'
                 ),
                 stacklevel=5,

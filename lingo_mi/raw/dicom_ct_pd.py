@@ -120,7 +120,7 @@ def taken(path: Path, views: list[_View]) -> Taken:
         values = each(name, count)
         if np.ptp(values, axis=0).any():
             other = int(np.argmax((values != values[0]).reshape(n, -1).any(1)))
-            raise InputError(f'{views[other].file}: {_named(name)} is another than in {first.file.name}; give one scan')
+            raise InputError(f'{views[other].file}: {_named(name)} differs from {first.file.name}; give one scan')
         return values[0]
 
     if first.shape not in ('CYLINDRICAL', 'FLAT'):

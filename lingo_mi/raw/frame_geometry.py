@@ -94,7 +94,7 @@ def geometry_of(
     suffix = path.suffix.lower()
     if suffix == '.xml':
         if options.pixel is None:
-            raise InputError(f"{path}: RTK's geometry says no size of pixels; give pixel=MM")
+            raise InputError(f"{path}: RTK's geometry does not say the size of a pixel; give pixel=MM")
         geometry = Geometry.from_rtk(path, nDetector=frames.shape, dDetector=options.pixel, **voxels)
         _require_shape(geometry, frames, path)
         return geometry, None, (-1, 1)

@@ -38,7 +38,7 @@ def open_txrm(path: Path) -> Recording:
         _integer(path, ole, f'ImageInfo/{name}') for name in ('NoOfImages', 'ImageHeight', 'ImageWidth')
     )
     if not 1 <= n <= MOST_VIEWS or not rows or not columns:
-        raise InputError(f'{path}: says {n} frames of {rows} x {columns} pixels; is damaged, copy it again')
+        raise InputError(f'{path}: says {n} frames of {rows} x {columns} pixels, so it is damaged; copy it again')
 
     def frames(names, kind):
         dtype = _TYPES.get(_integer(path, ole, kind))

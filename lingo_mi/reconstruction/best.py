@@ -96,7 +96,7 @@ class Chosen(Reconstruction):
         return '\n'.join(lines)
 
     def record(self) -> dict[str, Any]:
-        """The plan as plain values for a JSON file, with a check sum of its volume."""
+        """The plan as plain values for a JSON file, with a checksum of its volume."""
         return dict(
             volume=values_digest(self.volume),
             score='|A x - b| / |b| of the held-out views, weighted by the root of the frequency, after every pass',

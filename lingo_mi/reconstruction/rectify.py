@@ -104,8 +104,8 @@ def rectified_geometry(geometry: Geometry, what: str = 'an upright panel') -> Ci
     (left, inner_left, inner_right, right), (top, inner_top, inner_bottom, bottom) = _ends(shadow)
     if inner_top >= inner_bottom:
         raise InputError(
-            f'{what} needs a panel that sees some line along the circle from end to end; this one is turned in '
-            'its plane too far'
+            f'{what} needs a panel that sees some line along the circle from end to end; this one is turned '
+            'too far in its plane'
         )
     if len(geometry) > 1 and not gaps(geometry.angles, 2 * np.pi)[2]:
         if inner_right > -left:

@@ -60,7 +60,7 @@ class VolumeFile:
 
 
 def _planned(plan: Path) -> str | None:
-    """The check sum of the volume that a plan of `best` has made, if there is one that says."""
+    """The checksum of the volume that a plan of `best` has made, if there is one that says."""
     try:
         return parsed_json(plan.read_text(encoding='utf-8')).get('volume')
     except (OSError, ValueError, AttributeError):

@@ -83,7 +83,7 @@ class Live:
 
     def search(self, iteration: int, held_out: float) -> None:
         """See `watch.Watcher`."""
-        error = '' if np.isnan(held_out) else f', error of the views held out {held_out:.4g}'
+        error = '' if np.isnan(held_out) else f', error of held-out views {held_out:.4g}'
         with self._lock:
             self._line = f'Search for the step to stop at: step {iteration:,}{error}. The fit begins after it.'
 

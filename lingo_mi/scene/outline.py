@@ -177,4 +177,4 @@ def _require_encoding(path: Path, encoding: str | None):
 
 
 def _refuse_document_type(path: Path):
-    raise InputError(f'{path}: declares a document type, which scenes have not; remove <!DOCTYPE ...>')
+    raise InputError(f'{path}: declares a document type, which scenes do not have; remove <!DOCTYPE ...>')

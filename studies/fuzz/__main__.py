@@ -45,7 +45,7 @@ def main() -> int:
     names = args.readers or list(NAMES)
     unknown = [name for name in names if name not in NAMES]
     if unknown:
-        raise InputError(f'--readers {unknown[0]}: is none of {", ".join(NAMES)}')
+        raise InputError(f'--readers {unknown[0]}: is not one of {", ".join(NAMES)}')
     cases = args.cases if args.total is None else -(-args.total // len(names))
     if not all(0 < x < math.inf for x in (cases, args.processes, args.seconds, args.memory)):
         raise InputError('--cases, --total, --processes, --seconds and --memory must be positive')

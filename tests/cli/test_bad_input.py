@@ -322,7 +322,7 @@ def test_pickle_runs_no_code(scene, tmp_path):
         ('shape', 'shape'),
         ('zero', 'zero everywhere'),
         ('negative', 'nowhere above zero'),
-        ('none', 'filled array'),
+        ('none', 'non-empty array'),
         ('no geometry', 'geometry'),
         ('key', 'nDetektor'),
         ('angles', 'angles'),

@@ -340,7 +340,7 @@ def test_one_line_that_names_element_and_place(scene_file, old, new, match):
 
 def test_a_panel_has_no_crop_window():
     film = detector(width=40, height=30, crop_offset_x=5, crop_offset_y=0, crop_width=20, crop_height=30)
-    with pytest.raises(RuntimeError, match='has no crop window'):
+    with pytest.raises(RuntimeError, match='cannot have a crop window'):
         load(dict(cloud=ellipsoids(cloud_of())), dict(type='perspective', film=film))
 
 

@@ -19,7 +19,7 @@ LARGEST = float(np.finfo(np.float32).max)
         ([[1.0], [-np.inf]], 'f: holds NaN or infinity (first at (1, 0)); mask or repair those values first'),
         ([1.0, 1.01 * LARGEST], 'f: holds values beyond 3.4e38, the range of float32; scale them down first'),
         ([1.0, -1.01 * LARGEST], 'f: holds values beyond 3.4e38, the range of float32; scale them down first'),
-        ([], 'f: has the shape (0,), but a filled array is needed'),
+        ([], 'f: has the shape (0,), but a non-empty array is needed'),
         (['1'], 'f: holds <U1 values; real numbers are needed'),
         ([1j], 'f: holds complex128 values; real numbers are needed'),
     ],
@@ -42,7 +42,7 @@ def test_what_need_not_be_finite():
 
 
 def test_dimensions():
-    with pytest.raises(InputError, match=r'has the shape \(2,\), but a filled array of 3 dimensions is needed'):
+    with pytest.raises(InputError, match=r'has the shape \(2,\), but a non-empty array of 3 dimensions is needed'):
         numeric(np.zeros(2), 'f', 3)
 
 

@@ -112,7 +112,7 @@ def test_bad_input(path, tmp_path):
         write(path, geometry, **data)
         refused(words, lambda: read_scan(path))
 
-    rewritten({'entry/data': VALUES}, 'has no dataset exchange/data in this file; name that')
+    rewritten({'entry/data': VALUES}, 'has no dataset exchange/data in this file; name the dataset')
     rewritten({'a': VALUES}, 'has no dataset /b in this file', dataset='/b')
     rewritten({'a': VALUES}, 'dataset must be the name of a dataset, not 3', dataset=3)
     rewritten({'exchange/data': VALUES, 'exchange/data_white': VALUES}, 'raw frames .* lingo-mi import')

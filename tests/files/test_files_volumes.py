@@ -104,7 +104,7 @@ def test_bad_nifti(tmp_path):
         assert str(zipped) in refused(zipped, 'damaged')
     write_volume(zipped, np.random.default_rng(0).uniform(0, 1, (40, 40, 40)), Grid(40, SPACING))
     raw = zipped.read_bytes()
-    zipped.write_bytes(raw[:-8] + bytes([raw[-8] ^ 1]) + raw[-7:])  # the check sum, which nibabel does not reach
+    zipped.write_bytes(raw[:-8] + bytes([raw[-8] ^ 1]) + raw[-7:])  # the checksum, which nibabel does not reach
     refused(zipped, 'CRC')
     import nibabel
 

@@ -152,7 +152,7 @@ def test_a_volume_to_scan_and_to_write_in_hounsfield_units(tmp_path, monkeypatch
     options = dict(volume=str(tmp_path / 'v.npy'), projections=None, shape=None, dtype=None, spacing=[4.0], units='hu')
     args = argparse.Namespace(**options, mu_water=WATER)
     if expected is None:
-        with pytest.raises(InputError, match="not attenuation per mm, so that units='hu' cannot be written"):
+        with pytest.raises(InputError, match="not attenuation per mm, so units='hu' cannot be written"):
             read_input(args, None, 0)
     else:
         np.testing.assert_allclose(read_input(args, None, 0), expected * mu, atol=1e-6)

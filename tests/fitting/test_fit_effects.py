@@ -337,7 +337,7 @@ def test_what_a_fit_leaves_behind(tmp_path):
                 None,
                 None,
             ),
-            'leave two',
+            'keep two',
         ),
     ],
 )

@@ -115,7 +115,7 @@ def test_the_search_has_the_rates_of_the_fit(scan, monkeypatch):
 def test_what_is_told(scan, whole):
     numbers = fit_metrics(whole)
     assert numbers['iterations'] == whole.steps and numbers['search']['best'] == whole.steps
-    assert numbers['stopping'] == f'stopped at step {whole.steps}: held-out error did not fall for 30 steps more'
+    assert numbers['stopping'] == f'stopped at step {whole.steps}: held-out error did not fall for 30 more steps'
     assert numbers['stopping'] in summary(numbers)
     seen = []
     run(scan, METHOD.changed(iterations=10), progress=lambda done, **f: seen.append(f))

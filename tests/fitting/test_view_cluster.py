@@ -111,7 +111,7 @@ def test_what_workers_cannot_do(scan, two_workers):
     for options in dict(rate_pose=(1e-3, 1e-3)), dict(fit_air='view'):
         with pytest.raises(InputError, match='workers, which cannot fit poses, air levels'):
             run(scan, TWO.changed(**options), cluster=two_workers)
-    with pytest.raises(InputError, match='views of Gaussians among workers, not those of naf'):
+    with pytest.raises(InputError, match='fit of Gaussians among workers, but naf has none'):
         run(scan, METHODS['naf'].changed(batch=2), cluster=two_workers)
     with pytest.raises(InputError, match='threads of this process, which share one Dr.Jit: start processes'):
         run(scan, TWO, cluster=stand_in('inproc://10.0.0.1/1/2'))

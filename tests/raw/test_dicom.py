@@ -103,7 +103,7 @@ def test_a_ct_pd_scan_needs_no_flats(tmp_path):
     data = pydicom.dcmread(tmp_path / 'scan' / 'x.dcm')
     data[0x70311031].value = 1000.0
     data.save_as(tmp_path / 'scan' / 'x.dcm')
-    with pytest.raises(lm.InputError, match=r'x.dcm: ConstantRadialDistance .* is another than in'):
+    with pytest.raises(lm.InputError, match=r'x.dcm: ConstantRadialDistance .* differs from'):
         load(tmp_path / 'scan')
 
 

@@ -171,7 +171,7 @@ def test_a_fit_that_stops_early(live):
     step = lambda **fields: watch.step(loss=lambda: 0.5, gaussians=None, **fields)  # noqa: E731
     watch._reported = -1.0
     step(iteration=10, held_out=0.25)
-    assert asked(live)['line'].startswith('Search for the step to stop at: step 10, error of the views held out 0.25.')
+    assert asked(live)['line'].startswith('Search for the step to stop at: step 10, error of held-out views 0.25.')
     watch._reported = -1.0
     step(iteration=100, stops_at=400)
     assert asked(live)['line'].startswith('Step 100 of 400, loss 0.5, ')
