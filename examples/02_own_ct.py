@@ -35,7 +35,7 @@ data
 
 # %%
 # The fit, from the 20 views alone. Densities keep their unit. Sliders go through the fitted volume and the held-out views; the
-# picture below them has the true slices and the difference. Ribs and vessels of a voxel's width are more than 20 views tell.
+# picture below them has the true slices and the difference. Ribs and vessels of a voxel's width need more than 20 views.
 
 fit = lm.fit(data, 'fast', iterations=250, n_points=4000)
 fit

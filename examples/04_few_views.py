@@ -56,6 +56,6 @@ for axis, (title, volume) in zip(axes.flat, shown.items()):
 print(volumes['refined'].save(Path(tempfile.mkdtemp()) / 'refined.nii.gz').name)
 
 # %%
-# FDK has streaks. On these clean projections 20 passes of SART or ASD-POCS are about as good as the cloud, and what starts from
-# the cloud is 3 dB better. The projections were simulated from the voxels themselves, without noise, which favours whatever
-# works on voxels. The benchmarks have noise, other objects, and objects finer than the voxels.
+# FDK has streaks. On these clean projections 20 passes of SART or ASD-POCS are about as good as the cloud, and volumes that
+# start from the cloud are 3 dB better. The projections were simulated from the voxels themselves, without noise, which favours
+# algorithms on voxels. The benchmarks have noise, other objects, and objects finer than the voxels.

@@ -23,8 +23,8 @@ nominal = lm.Geometry.helix(**scanner, grid=foot.grid, angles=angles, pitch=60)
 nominal
 
 # %%
-# What it really does: every view is turned and shifted a little. What all views have in common is taken off, for that is a
-# motion of the object, which no projection tells.
+# What it really does: every view is turned and shifted a little. The motion that all views share is subtracted, because it is
+# the same as a motion of the object, which no projection tells.
 
 rng = np.random.default_rng(1)
 turns, shifts = rng.normal(0, 1, (count, 3)), rng.normal(0, 2, (count, 3))  # degrees, mm

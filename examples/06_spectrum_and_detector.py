@@ -35,7 +35,7 @@ axes[1, 1].set(title='middle row', xlabel='x [voxels]', ylabel='density [1/mm]')
 axes[1, 1].legend(loc='center right', fontsize='small')
 
 # %%
-# If the spectrum is ignored, metal comes out too thin, in its middle most ("cupping"), and the hole is not empty.
+# If the spectrum is ignored, metal has too low a density, most of all in its middle ("cupping"), and the hole is not empty.
 
 for name, fit in fits.items():
     error = fit.volume() - data.volume

@@ -20,7 +20,7 @@ lm.use_variant()
 import mitsuba as mi
 
 # %%
-# A cloud of 200 Gaussians beside a steel cube, before a scanner of 60 views.
+# A cloud of 200 Gaussians beside a steel cube, and a scanner with 60 views.
 
 rng = np.random.default_rng(0)
 gaussians = np.concatenate(

@@ -7,7 +7,7 @@ A Gaussian has no end; its footprint is cut off at some standard deviations. Tha
 """
 
 # %%
-# An image of 30,000 Gaussians at cut-offs from 2 to 8, how far it is from that at 9, and the time it takes.
+# An image of 30,000 Gaussians at cut-offs from 2 to 8: how much it differs from the image at 9, and the time it takes.
 
 import time
 
@@ -41,7 +41,7 @@ for extent in cutoffs:
     errors.append(np.linalg.norm(image - reference) / np.linalg.norm(reference))
 
 # %%
-# The error falls by the tail of a Gaussian, down to rounding; the time grows by the area of the footprints. The full price
+# The error falls with the tail of a Gaussian, down to rounding; the time grows with the area of the footprints. The full price
 # list, with other methods and with derivatives, is in the accuracy page.
 
 fig, axes = plt.subplots(1, 2, figsize=(9, 3.6), layout='constrained')

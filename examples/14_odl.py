@@ -7,7 +7,7 @@ needs ``pip install odl``.
 """
 
 # %%
-# An operator says its domain and range, how it is called, and its adjoint. With weights of 1, the adjoint is the transpose.
+# An operator states its domain and range, how it is called, and its adjoint. With weights of 1, the adjoint is the transpose.
 
 import matplotlib.pyplot as plt
 import numpy as np
