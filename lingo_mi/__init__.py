@@ -9,7 +9,7 @@
     lm.reconstruct(data.train, lm.SART(niter=20), start=fit)
     images = lm.project(fit.gaussians, data.test.geometry)    # or four arrays of NumPy, Dr.Jit, PyTorch, JAX
 
-Each name is loaded on first use. If no variant of Mitsuba is active, this chooses one. `import lingo_mi` and
+Each name is loaded on first use. If no variant of Mitsuba is active then, one is chosen. `import lingo_mi` and
 `mitsuba.set_variant(...)`, in either order, make the plugins known to Mitsuba.
 """
 

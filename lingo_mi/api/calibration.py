@@ -40,8 +40,8 @@ def calibrate(
     An axis of rotation off centre is a shift along u. On request, the response of the detector to line integrals is found, too.
 
     Quick reconstructions on few voxels predict the views, and the search looks for the panel with which predicted and measured
-    views agree best (`lingo_mi.calibration.search`). It takes some 30 such reconstructions, and 6 for each further number. It
-    does not look for a constant shift along v, which is hard to distinguish from an object that lies higher. A beam that drifts
+    views agree best (`lingo_mi.calibration.search`). It takes some 30 such reconstructions, and 6 more for each further unknown.
+    It does not look for a constant shift along v, which is hard to distinguish from an object that lies higher. A drifting beam
     looks like a panel that moves. If an edge of the panel shows air in all views, the level of air is therefore subtracted from
     each view first.
 

@@ -52,7 +52,7 @@ def simulate(
     geometry : Geometry or None
         The scanner of a phantom or a volume. A volume must have `geometry.grid.shape` voxels. Without a geometry, a phantom is
         scanned as in X3D: a cone beam, `views` views over half a turn (default: 50), and as many random ones held out. If
-        the grid of the geometry is not the phantom's, voxels are scanned instead of the formula.
+        the grid of the geometry is not the phantom's, its voxels are scanned instead of its formula.
     views : int or None
         How many of the views to fit, evenly spaced (default: all). The rest are held out, unless the scene or `held_out`
         provides held-out views. For a phantom without a geometry: how many views to scan.
@@ -63,7 +63,7 @@ def simulate(
     parameters : dict or None
         Values for the `<default>` names of a scene file.
     progress : bool
-        Whether to show a progress bar on standard error; scenes always do.
+        Whether to show a progress bar on standard error. Scenes always show one.
 
     Returns
     -------
@@ -186,10 +186,10 @@ def load_raw(
     progress : bool
         Whether to show a progress bar on standard error.
     options
-        Flats, darks (files or folders); air (v0, v1, u0, u1), percentile or i0: the air level; exposure (over the flats');
-        saturation, counts; crop (v0, v1, u0, u1); binning; views (first, end, step); angles, degrees or their file; pixel, mm;
-        rings and outliers, to be taken out, True or False.
-        `lingo_mi.raw.options.Options` describes them, and `lingo-mi import` writes a file.
+        Flats, darks (files or folders); air (v0, v1, u0, u1), percentile or i0: the air level; exposure (relative to the
+        flats); saturation (counts); crop (v0, v1, u0, u1); binning; views (first, end, step); angles (degrees, or their file);
+        pixel (mm); rings and outliers (True removes them).
+        `lingo_mi.raw.options.Options` describes them. `lingo-mi import` writes the scan to a file.
 
     Returns
     -------
@@ -228,8 +228,8 @@ def phantom(name: str, size: int = 256, seed: int = 0, *, attenuation: str = 'x3
     seed : int
         Seed of textures, vessels and random Gaussians.
     attenuation : {'x3d', 'real'}
-        'x3d': densities from 0 to 1, as in the published tables of X3D and R2-Gaussian. No scanner measures line integrals as
-        large as theirs. 'real': these densities times 0.0618 per mm, dense cortical bone at 60 keV. Soft tissue of the foot and
+        'x3d': densities from 0 to 1, as in the published tables of X3D and R2-Gaussian. No scanner measures such large
+        line integrals. 'real': these densities times 0.0618 per mm, dense cortical bone at 60 keV. Soft tissue of the foot and
         the head is then lighter than water, because the factor is right for bone.
 
     Returns

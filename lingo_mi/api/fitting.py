@@ -77,7 +77,7 @@ def fit(
     units, mu_water
         Units of the volume in the folder, as in `Fit.save`.
     progress : bool or callable
-        Whether to show a progress bar on standard error; or a function that is called between steps, as by `fitting.loop.run`.
+        Whether to show a progress bar on standard error, or a function that `fitting.loop.run` calls between steps.
     live : bool
         Serve a page that grows while the fit runs, to this machine alone. The fit prints its address; a notebook shows the page.
     log_dir : path, optional

@@ -94,8 +94,8 @@ def reconstruct(
     start : Fit or array, optional
         A fit to this scan, or a volume [x, y, z] in 1/mm, to start from. `Refined` needs one.
     views : int, optional
-        How many views to reconstruct from, with a fit as `start`. The fit renders those that were not measured (the second stage
-        of the paper), and the volume starts empty. The scan must be on a circle. `Refined` uses these views
+        How many views to reconstruct from, with a fit as `start`. The fit only renders the views that were not measured
+        (the second stage of the paper), and the volume starts empty. The scan must be on a circle. `Refined` uses these views
         first, and then the measured ones. Without `views`, it uses the measured ones alone.
     out : path, optional
         Write the volume there (.nii, .nii.gz, .ome.zarr or .dicom), as `Reconstruction.save` does.
@@ -103,8 +103,8 @@ def reconstruct(
         Units of the values in that file: '1/mm', '1/cm', or 'hu' with the attenuation of water in 1/mm (`Reconstruction.save`).
     slab : int, optional
         Number of slices in a slab. `FDK`, `SART`, `OSSART`, `SIRT` and `ASDPOCS` then make the volume slab by slab and write each
-        to `out`, so the volume need not fit into memory. Iterative ones store the volume in a folder beside `out`, whose name
-        ends in .slabs, while they work. If they are stopped, the same call continues.
+        to `out`, so the volume need not fit into memory. While they work, iterative algorithms store the volume in a folder
+        beside `out`, whose name ends in .slabs. If they are stopped, the same call continues.
     cluster : str or Client, optional
         A Dask cluster whose workers make the slabs (default: of 64 slices) and write them to `out`, an .ome.zarr: the scheduler's
         address or file, 'local:N' for N processes of this machine, or a client of `distributed`. Workers must see the folder of
@@ -117,8 +117,8 @@ def reconstruct(
     Returns
     -------
     Reconstruction or Path
-        `volume` float32 [x, y, z], density per mm; `residuals` |A x - b| / |b| of each pass, NaN if it was not computed;
-        `seconds`. It can be used as an array. With `slab` or `cluster`: the path of the volume.
+        The reconstruction can be used as an array. It has `volume`, float32 [x, y, z], density per mm; `residuals`,
+        |A x - b| / |b| of each pass, NaN if it was not computed; and `seconds`. With `slab` or `cluster`: the path of the volume.
 
     Raises
     ------

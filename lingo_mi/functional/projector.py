@@ -30,7 +30,7 @@ MODELS = 'joseph', 'exact'
 
 
 class Projector(LinearMap):
-    """Line integrals of a voxel volume in the views of a scan, A, and backprojection, its transpose A.T.
+    """A: line integrals of a voxel volume in the views of a scan. A.T: backprojection, the transpose of A.
 
     `A(volume)` takes densities [x, y, z], per mm, and returns line integrals [view, v, u] without a unit. `A.T(projections)`
     returns a number for each voxel: the sum over all pixels of the pixel's value times the weight of the voxel in the pixel's

@@ -62,7 +62,7 @@ class ASDPOCS(Algorithm):
     tviter : int
         Steps of steepest descent per pass, at least 1.
     alpha : float
-        Length of the first of them, relative to the change by the first P, above 0.
+        Length of the first step, relative to the change by the first P, above 0.
     alpha_red : float
         Factor on the length, 0 < alpha_red <= 1.
     rmax : float

@@ -137,7 +137,7 @@ class Best(Algorithm):
        limits them, and `Best` tries more total variation.
     3. With `prior`, it tries `PenalisedLeastSquares`, and the held-out views choose the strength. With `cloud`, it fits a cloud
        of Gaussians to the other views, and tries the best of these refinements from the cloud's volume.
-    4. `ASDPOCS` and `SART` get all their passes, unless a refinement is far ahead of `ASDPOCS` by then.
+    4. `ASDPOCS` and `SART` get all their passes, unless a refinement is already far ahead of `ASDPOCS`.
     5. The setting that predicts the held-out views best, with its number of passes, is applied to all views.
 
     Smaller voxels suit objects finer than the voxels, because the scan's voxels turn such detail into streaks. Streaks lie along
@@ -264,8 +264,8 @@ class Best(Algorithm):
         )
 
     def _judged(self, plan: list[Trial], train: Scan, held_out: Scan, count) -> Trial:
-        """The trial to apply. ASD-POCS and SART get all their passes, unless a refinement is far ahead of them. If one of them is
-        ahead then, the refinement gets all its passes, too.
+        """The trial to apply. ASD-POCS and SART get all their passes, unless a refinement is far ahead of ASD-POCS. If one of
+        them is ahead then, the refinement gets all its passes, too.
         """
 
         def error(trial: Trial) -> float:

@@ -54,7 +54,7 @@ class Refined(Algorithm):
     niter : int
         Passes over the measured views, at least 1.
     completed_niter : int
-        Passes over the completed views before, at least 0.
+        Earlier passes over the completed views, at least 0.
     tviter, alpha, alpha_red, rmax, maxl2err, exact_every
         See `ASDPOCS`. The defaults are for clean projections; with noise, maxl2err sets how closely to match them.
     finer : int

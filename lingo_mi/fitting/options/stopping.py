@@ -15,7 +15,8 @@ class Stopping(Part):
     Parameters
     ----------
     stop : {'off', 'on', 'auto'}
-        'off': after `iterations`. 'on': at the step after which a first fit predicts held-out views no better. 'auto': 'on' if
+        'off': after `iterations`. 'on': a first fit finds the step after which it predicts held-out views no better, and
+        a second fit of all views ends there. 'auto': 'on' if
         the scan says how many photons a pixel counts, else 'off'.
     stop_every : int
         Iterations between two predictions of the held-out views.

@@ -69,9 +69,9 @@ def conditions(c: dict) -> str:
     """Describe the conditions of the measurements in a sentence."""
     s = c['sizes']
     return (
-        f'`{c["variant"]}` on {c["threads"]} threads of {c["machine"]}. Unless a table says otherwise: '
+        f'`{c["variant"]}` on {c["threads"]} threads of {c["machine"]}. Unless a table says otherwise, it has '
         f'{s["gaussians"]:,} Gaussians ({s["few"]:,} where other methods are compared, {s["few"] // 2:,} for pixels), '
-        f'{s["pixels"]} × {s["pixels"]} pixels, {s["box"]:g} pixels in the box of a Gaussian at 3 σ; '
+        f'{s["pixels"]} × {s["pixels"]} pixels, {s["box"]:g} pixels in the box of a Gaussian at 3 σ, and '
         f'medians of up to {s["rounds"]} rounds ± half the interquartile range.'
     )
 
