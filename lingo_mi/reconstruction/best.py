@@ -38,6 +38,7 @@ from lingo_mi.storage.file_access import as_path, new_file, write_text, writing
 START, TRIAL = 10, 4  # passes of ASD-POCS before the refinement, at most; passes after which grids are compared
 LONG, SWEEPS = 50, 20  # passes of ASD-POCS and of SART, at most, if they are the result itself
 AHEAD = 0.9  # times another score: below it a setting is clearly ahead, whatever passes the other one still gets
+CLOSE = 0.95  # the same for smaller voxels, whose passes cost eight times as much
 TESTED = 8  # passes of a refinement that are tried: if the last of them still gain, noise does not limit their number
 MARGIN = 1.02  # how much better the scan's own voxels must be than smaller ones, see `Best`
 PLAIN = 1.015  # how much better ASD-POCS and SART must be than a refinement, see `Best`
@@ -304,11 +305,13 @@ class Best(Algorithm):
         if not ahead and scan_voxels.niter == TRIAL < self.niter:  # it was cut short, and may gain from a longer start
             plan[0] = _alone(ASDPOCS(niter=LONG, seed=self.seed), train, held_out, count)
             plan[1] = self._try(train, held_out, plan[0], _refined(1), count)
-        # Passes on the scan's voxels cost an eighth, and often gain for longer.
-        for i, start in ((1, plan[0]), (2, plain)):
-            if _best(plan[1:]) is plan[i] or not _may_overtake(plan[i], _best(plan[1:])):
+        starts = None, plan[0], plain
+        for _ in range(2 * len(plan[2:])):
+            best = _best(plan[1:])
+            i = 2 if best is plan[1] else 1
+            if not _may_overtake(plan[i], best):
                 break
-            plan[i] = self._try(train, held_out, start, _refined(plan[i].finer), count, self.niter)
+            plan[i] = self._try(train, held_out, starts[i], _refined(plan[i].finer), count, self.niter)
         best = _best(plan[1:])
         if best.score > LITTLE * best.scores[0]:
             from_ = plan[0] if best.finer == 1 else plain
@@ -426,7 +429,7 @@ def _best(trials: Sequence[Trial]) -> Trial:
 
 def _may_overtake(trial: Trial, best: Trial) -> bool:
     """Whether a trial that was cut short still gained, and is near the best one."""
-    return len(trial.scores) < trial.passes and AHEAD * trial.score < best.score
+    return len(trial.scores) < trial.passes and best.score > (AHEAD if trial.finer == 1 else CLOSE) * trial.score
 
 
 def _alone(algorithm: ASDPOCS | SART, train: Scan, held_out: Scan, count) -> Trial:

@@ -267,10 +267,12 @@ def test_asd_pocs_and_sart_are_candidates_to_the_end(monkeypatch, best, score, v
     'own, finer, passes',
     [
         ([0.60, 0.51, 0.40], [0.50, 0.49], [20, 8]),  # the scan's own voxels overtake
-        ([0.60, 0.51, 0.45], [0.50, 0.49, 0.30], [20, 20]),  # and the smaller ones, which still gain, get theirs
+        ([0.60, 0.51, 0.48], [0.50, 0.49, 0.30], [20, 20]),  # and the smaller ones, which still gain, get theirs
         ([0.60, 0.51, 0.505], [0.50, 0.49, 0.30], [20, 8]),  # they do not
         ([0.60, 0.56, 0.40], [0.50, 0.49], [8, 8]),  # they are too far behind
-        ([0.50, 0.45], [0.60, 0.46], [8, 8]),  # they are ahead anyway
+        ([0.50, 0.45], [0.60, 0.46, 0.30], [8, 20]),  # the smaller ones overtake
+        ([0.50, 0.45, 0.44], [0.60, 0.46, 0.43], [20, 20]),  # and the scan's own, which still gain, get theirs
+        ([0.50, 0.45], [0.60, 0.48, 0.30], [8, 8]),  # the smaller ones, which cost more, are too far behind
     ],
 )
 def test_who_is_a_little_behind_and_still_gains_gets_all_passes(monkeypatch, own, finer, passes):
