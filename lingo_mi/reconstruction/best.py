@@ -305,13 +305,13 @@ class Best(Algorithm):
         if not ahead and scan_voxels.niter == TRIAL < self.niter:  # it was cut short, and may gain from a longer start
             plan[0] = _alone(ASDPOCS(niter=LONG, seed=self.seed), train, held_out, count)
             plan[1] = self._try(train, held_out, plan[0], _refined(1), count)
-        starts = None, plan[0], plain
+        # After few passes, the one that is behind may still overtake.
         for _ in range(2 * len(plan[2:])):
             best = _best(plan[1:])
-            i = 2 if best is plan[1] else 1
+            i, start = (2, plain) if best is plan[1] else (1, plan[0])
             if not _may_overtake(plan[i], best):
                 break
-            plan[i] = self._try(train, held_out, starts[i], _refined(plan[i].finer), count, self.niter)
+            plan[i] = self._try(train, held_out, start, _refined(plan[i].finer), count, self.niter)
         best = _best(plan[1:])
         if best.score > LITTLE * best.scores[0]:
             from_ = plan[0] if best.finer == 1 else plain
