@@ -308,10 +308,10 @@ class Best(Algorithm):
         # After few passes, the one that is behind may still overtake.
         for _ in range(2 * len(plan[2:])):
             best = _best(plan[1:])
-            i, start = (2, plain) if best is plan[1] else (1, plan[0])
+            i = 2 if best is plan[1] else 1
             if not _may_overtake(plan[i], best):
                 break
-            plan[i] = self._try(train, held_out, start, _refined(plan[i].finer), count, self.niter)
+            plan[i] = self._try(train, held_out, plan[0], _refined(plan[i].finer), count, self.niter)
         best = _best(plan[1:])
         if best.score > LITTLE * best.scores[0]:
             from_ = plan[0] if best.finer == 1 else plain
