@@ -79,7 +79,7 @@ def test_bad_files(tmp_path):
 def test_write_refuses(tmp_path):
     for image, match in (
         (IMAGE[0], '2 dimensions'),
-        (IMAGE[:0], 'filled'),
+        (IMAGE[:0], 'non-empty'),
         (IMAGE * np.nan, 'NaN'),
         (np.array([['a']]), 'real numbers'),
     ):

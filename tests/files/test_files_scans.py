@@ -216,7 +216,7 @@ def test_bad_geometry_files(tmp_path, changes, match):
 
 def test_bad_npy_scans(tmp_path):
     for projections, match in (
-        (PROJECTIONS[:0], 'filled'),
+        (PROJECTIONS[:0], 'non-empty'),
         (PROJECTIONS[0], '3 dimensions'),
         (PROJECTIONS * np.nan, 'NaN'),
         (PROJECTIONS * 1j, 'real numbers'),

@@ -64,7 +64,7 @@ def test_bad_values(tmp_path):
     for array, match, options in (
         (COUNTS * 0, 'empty', {}),
         (COUNTS[0], '3 dimensions', {}),
-        (COUNTS[:0], 'filled', {}),
+        (COUNTS[:0], 'non-empty', {}),
         (np.full(SHAPE, np.nan), 'NaN', {}),
         (np.full(SHAPE, 1j), 'real numbers', {}),
         (COUNTS, 'do not look like Hounsfield', {'mu_water': 0.02}),

@@ -139,7 +139,7 @@ def test_fan_beam_of_one_row(degrees):
     centre = np.array([12.0, -9.0, 0.0])
     volume = run_algorithm(ellipsoids(turned, (centre, np.full(3, 25.0), 0.02)), FDK()).volume
     assert abs(volume[np.linalg.norm(centres(geo) - centre, axis=-1) < 12].mean() / 0.02 - 1) < 0.01
-    with pytest.raises(InputError, match='turned in its plane'):
+    with pytest.raises(InputError, match='turned too far in its plane'):
         rectified_geometry(moved(geo, (0, 0, 2)))
 
 
