@@ -24,7 +24,7 @@ from lingo_mi.geometry import Geometry, Grid
 from lingo_mi.projectors.upload import uploaded
 from lingo_mi.reconstruction.algorithm import Algorithm, Progress, Reconstruction
 from lingo_mi.reconstruction.asd_pocs import ASDPOCS
-from lingo_mi.reconstruction.held_out import PATIENCE, Score, Trial, TrialWatch, split_views
+from lingo_mi.reconstruction.held_out import NEAR, PATIENCE, Score, Trial, TrialWatch, split_views
 from lingo_mi.reconstruction.parameters import check_counts
 from lingo_mi.reconstruction.penalised import MOST, TRIED, PenalisedLeastSquares
 from lingo_mi.reconstruction.priors import Prior
@@ -300,11 +300,15 @@ class Best(Algorithm):
         scan_voxels = self._try(train, held_out, plain, _refined(1), count, TRIAL)
         plan.append(scan_voxels)
         if self.finer > 1:
-            plan.append(self._try(train, held_out, plain, _refined(self.finer), count, beat=scan_voxels.score))
+            beat = AHEAD * scan_voxels.score
+            plan.append(self._try(train, held_out, plain, _refined(self.finer), count, beat=beat))
         ahead = any(min(trial.scores[:TRIAL]) < AHEAD * scan_voxels.score for trial in plan[2:])
         if not ahead and scan_voxels.niter == TRIAL < self.niter:  # it was cut short, and may gain from a longer start
             plan[0] = _alone(ASDPOCS(niter=LONG, seed=self.seed), train, held_out, count)
             plan[1] = self._try(train, held_out, plan[0], _refined(1), count)
+            if self.finer > 1:
+                beat = NEAR * min(plan[1].scores[:TRIAL])
+                plan[2] = self._try(train, held_out, plan[0], _refined(self.finer), count, beat=beat)
         # After few passes, the one that is behind may still overtake.
         for _ in range(2 * len(plan[2:])):
             best = _best(plan[1:])
@@ -314,10 +318,9 @@ class Best(Algorithm):
             plan[i] = self._try(train, held_out, plan[0], _refined(plan[i].finer), count, self.niter)
         best = _best(plan[1:])
         if best.score > LITTLE * best.scores[0]:
-            from_ = plan[0] if best.finer == 1 else plain
             smooth = _refined(best.finer, smooth=True)
             # Its long steps start badly, so that a few passes do not show how good it gets.
-            plan.append(self._try(train, held_out, from_, smooth, count, self.niter))
+            plan.append(self._try(train, held_out, plan[0], smooth, count, self.niter))
             best = _best(plan[1:])
         if self.prior is not None:
             strength, volume, scores, _ = self._penalised(None).search(train, held_out, None, count, TRIED * MOST)

@@ -169,7 +169,7 @@ class TrialWatch:
     score : Score
         Score of the held-out views, on the trial's voxels.
     beat : float or None
-        Score to come near, to `NEAR`, by the pass `by`, else the trial ends there; None: it goes on.
+        Score to fall below by the pass `by`, else the trial ends there; None: it goes on.
     slow : bool
         Whether the trial ends, too, when `PATIENCE` passes lower its score by less than `GAIN`.
     """
@@ -182,7 +182,7 @@ class TrialWatch:
         trial.scores.append(self.score(x))
         if trial.niter == done:
             trial.volume = x.numpy().reshape(self.score.size)
-        if self.beat is not None and done == self.by and trial.score >= NEAR * self.beat:
+        if self.beat is not None and done == self.by and trial.score >= self.beat:
             return True
         if self.slow and done > PATIENCE and trial.score > (1 - GAIN) * min(trial.scores[:-PATIENCE]):
             return True
