@@ -299,11 +299,12 @@ class Best(Algorithm):
         plan = [plain]
         scan_voxels = self._try(train, held_out, plain, _refined(1), count, TRIAL)
         plan.append(scan_voxels)
+        gains = scan_voxels.niter == TRIAL < self.niter
         if self.finer > 1:
-            beat = AHEAD * scan_voxels.score
+            beat = (AHEAD if gains else NEAR) * scan_voxels.score
             plan.append(self._try(train, held_out, plain, _refined(self.finer), count, beat=beat))
         ahead = any(min(trial.scores[:TRIAL]) < AHEAD * scan_voxels.score for trial in plan[2:])
-        if not ahead and scan_voxels.niter == TRIAL < self.niter:  # it was cut short, and may gain from a longer start
+        if gains and not ahead:  # both were cut short, and may gain from a longer start
             plan[0] = _alone(ASDPOCS(niter=LONG, seed=self.seed), train, held_out, count)
             plan[1] = self._try(train, held_out, plan[0], _refined(1), count)
             if self.finer > 1:
