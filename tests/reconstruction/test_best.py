@@ -294,6 +294,21 @@ def test_who_is_a_little_behind_and_still_gains_gets_all_passes(monkeypatch, own
     assert [len(trial.scores) for trial in plan[1:3]] == passes
 
 
+def test_both_sizes_of_voxels_start_alike(monkeypatch):
+    """More passes of ASD-POCS before one of them would decide between them."""
+    starts = {1: [], 2: []}
+
+    def tried(self, train, held_out, start, trial, count, niter=8, beat=None):
+        starts[trial.finer].append(start)
+        trial.scores = [1 - 0.01 * k for k in range(niter)]
+        return trial
+
+    monkeypatch.setattr(Best, '_try', tried)
+    monkeypatch.setattr('lingo_mi.reconstruction.best._alone', lambda algorithm, *_: Trial(algorithm.name, 1))
+    plan = Best()._plan(None, None, None, None)
+    assert len(starts[2]) == 2 and starts[1][-1] is starts[2][-1] is plan[0]
+
+
 def test_a_prior_is_a_candidate():
     scan, _ = scanned(1, 300.0)
     result = run_algorithm(scan, Best(niter=2, finer=1, prior=lm.TV()))
