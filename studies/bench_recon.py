@@ -34,7 +34,7 @@ os.environ.setdefault('OMP_WAIT_POLICY', 'passive')  # idle threads of one packa
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('--size', type=int, default=256, metavar='N', help='voxels and pixels along a side (default: 256)')
     p.add_argument('--views', type=int, default=100, metavar='N', help='(default: 100)')
     p.add_argument('--repeats', type=int, default=5, metavar='N', help='rounds (default: 5)')

@@ -18,7 +18,7 @@ from studies.command import run_study
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('checkpoint', type=Path, help='checkpoint.npz of a fit of a cloud')
     p.add_argument('--repeats', type=int, default=31, metavar='N', help='turns (default: 31)')
     p.add_argument('--variant', metavar='V', help='Mitsuba variant (default: cuda_ad_mono, else llvm_ad_mono)')

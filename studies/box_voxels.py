@@ -10,7 +10,6 @@ constant but within half a piece of its faces. The scanned object is the scene's
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
@@ -50,7 +49,7 @@ def with_boxes(dataset: Dataset, cut: int = 2) -> Dataset:
 
 
 def main() -> None:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('scene', help='a scene file, or the name of a shipped one')
     p.add_argument('out', type=Path, metavar='F.pickle', help='the scan, for --projections')
     p.add_argument('--cut', type=int, default=2, metavar='N', help='pieces of a voxel along each side (default 2)')

@@ -22,7 +22,7 @@ from studies.command import run_study
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('--stand-in', required=True, metavar='PROGRAM', help='runs a command with a stand-in for the driver')
     p.add_argument(
         '--tests', type=Path, default=Path('tests'), metavar='FOLDER', help='tests of the checkout (default: tests)'

@@ -143,7 +143,7 @@ def run_part(part: Part, out: Path, stand_in: str | None) -> Outcome:
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('--out', type=Path, default=Path('out/on_a_gpu'), metavar='DIR', help='(default: out/on_a_gpu)')
     p.add_argument('--stand-in', metavar='PROGRAM', help='rehearse under a stand-in for the CUDA driver')
     p.add_argument('--parts', nargs='+', metavar='NAME', help='parts to run (default: all)')

@@ -7,7 +7,6 @@ Run it on a machine that does nothing else.
 
 from __future__ import annotations
 
-import argparse
 import statistics
 import time
 
@@ -38,7 +37,7 @@ def seconds(method: DensityMethod, scan: Scan) -> list[float]:
 
 
 def main() -> None:
-    Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    Parser(description=__doc__).parse_args()
     scan = lm.simulate('x3d_foot', views=25).train
     print('| start | s, median | least | most | paper, s |\n|---|---:|---:|---:|---:|')
     for name, method in methods().items():

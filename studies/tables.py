@@ -34,7 +34,7 @@ from studies.command import run_study
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('table', choices=('views', 'ct', 'ablation', 'controls'))
     p.add_argument('--objects', nargs='+', metavar='NAME', help='(default: the objects of the scale)')
     p.add_argument('--scale', choices=('small', 'paper'), default='small', help='see above (default: small)')

@@ -13,7 +13,6 @@ presets into a page there.
 --presets measures the table of the presets alone, which needs no ray tracing. --beside adds another variant's errors to it.
 """
 
-import argparse
 import sys
 import time
 from pathlib import Path
@@ -24,7 +23,7 @@ from lingo_mi.storage.file_access import require_writable
 
 
 def parser() -> Parser:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('--quick', action='store_true', help='smaller sizes and fewer repeats')
     p.add_argument('--presets', action='store_true', help='the presets alone: their table, no plots')
     p.add_argument(

@@ -34,7 +34,7 @@ SHOWN = 'psnr_2d', 'ssim_2d', 'psnr_3d', 'ssim_3d', 'gaussians', 'seconds_fit'
 
 
 def parser() -> Parser:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('list', type=Path, metavar='LIST.csv', help='the scans, see above')
     p.add_argument('--out', type=Path, required=True, metavar='DIR', help='folder of the results')
     p.add_argument(

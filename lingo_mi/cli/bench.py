@@ -26,7 +26,7 @@ MOST_PIXELS = 30_000  # a larger box would leave limit.cpp's image
 
 
 def parser() -> Parser:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('--gaussians', type=int, default=50_000)
     p.add_argument('--size', type=int, default=512, help='pixels along a side of the square panel')
     p.add_argument('--pixels', type=float, default=234, help="mean pixels in a Gaussian's box")

@@ -1,7 +1,6 @@
 """Find where a scanner's panel really is (an axis off centre, a turn of the panel in its plane, a drift), and the response of
 its detector to line integrals."""
 
-import argparse
 import warnings
 from pathlib import Path
 
@@ -18,7 +17,7 @@ examples:
 
 
 def parser() -> Parser:
-    p = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__, epilog=EPILOG)
     p.add_argument(
         'scan', help='a scan in any format that --projections of fit reads, views in the order of their time'
     )

@@ -9,6 +9,7 @@ import os
 import re
 import shlex
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -26,11 +27,37 @@ from lingo_mi.scene.shipped import scene_path, scenes
 from lingo_mi.storage.file_access import require_new_folder, require_writable
 
 
+class Help(argparse.HelpFormatter):
+    """Help whose text fills the terminal.
+
+    Paragraphs are filled, and so is the second column of a list, which two spaces begin. Commands are not broken, so that they
+    can be copied.
+    """
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        blocks: list[tuple[str, int]] = [('', -1)]  # text, and how far lines that continue it are indented
+        for line in text.strip().split('\n'):
+            margin = len(line) - len(line.lstrip())
+            command = line.lstrip().startswith(('lingo-mi ', 'python '))
+            if line and not command and margin == blocks[-1][1]:
+                blocks[-1] = f'{blocks[-1][0]} {line.lstrip()}', margin
+            else:
+                column = re.match(r' +\S.*?  +(?=\S)', line)
+                blocks.append((line, -1 if command or not line else column.end() if column else margin))
+        return '\n'.join(
+            block if margin < 0 else textwrap.fill(block, width, subsequent_indent=' ' * margin)
+            for block, margin in blocks[1:]
+        )
+
+
 class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are one line, like any other bad input. `running` is the last one that has parsed, with
     what it has read."""
 
     running: ClassVar[tuple[Parser, argparse.Namespace] | None] = None
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(formatter_class=Help, **settings)
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         parsed = super().parse_known_args(args, namespace)

@@ -1,6 +1,5 @@
 """Show results side by side: the same slices and views, their differences, numbers, settings and times, in one page."""
 
-import argparse
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser, spacing_argument
@@ -17,7 +16,7 @@ examples:
 
 
 def parser() -> Parser:
-    p = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__, epilog=EPILOG)
     p.add_argument(
         'results',
         nargs='+',

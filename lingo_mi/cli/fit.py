@@ -38,7 +38,7 @@ from lingo_mi.storage.output_folder import CHECKPOINT, CLOUD, METRICS, PAGE, SCE
 
 
 def parser() -> Parser:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     input_arguments(p)
     p.add_argument(
         '--method',

@@ -6,15 +6,13 @@
 The exit code is 1 if an error is above 1e-4, and 2 for a scene that cannot be checked.
 """
 
-import argparse
-
 from lingo_mi.cli.common import Parser
 from lingo_mi.common.runtime import use_variant
 from lingo_mi.scene.shipped import scene_path
 
 
 def parser() -> Parser:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument(
         'scene', metavar='SCENE', help='a Mitsuba scene with the integrator lingo_xray, or the name of a shipped one'
     )

@@ -1,6 +1,5 @@
 """Turn raw frames into a scan that every command reads: line integrals, their geometry, and a mask of valid pixels."""
 
-import argparse
 from pathlib import Path
 
 from lingo_mi.cli.common import Parser, check_scan_output
@@ -22,7 +21,7 @@ examples:
 
 
 def parser() -> Parser:
-    p = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__, epilog=EPILOG)
     add = p.add_argument
     add(
         'frames',

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +20,7 @@ examples:
 
 
 def parser() -> Parser:
-    p = Parser(description=__doc__, epilog=EPILOG, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__, epilog=EPILOG)
     p.add_argument('scan', help='a scan in any format that --projections of fit reads')
     p.add_argument('--out', type=Path, metavar='F.png', help='where to draw (default: the name of the scan, .png)')
     p.add_argument('--force', action='store_true', help='replace an earlier picture')

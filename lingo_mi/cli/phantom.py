@@ -49,9 +49,7 @@ def listing() -> str:
 
 
 def parser() -> Parser:
-    p = Parser(
-        description=__doc__, epilog=EPILOG.format(list=listing()), formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    p = Parser(description=__doc__, epilog=EPILOG.format(list=listing()))
     p.add_argument('name', nargs='?', metavar='NAME', help='which phantom, see below')
     p.add_argument('--list', action='store_true', help='print the names and exit')
     p.add_argument('--size', type=int, default=256, metavar='N', help='voxels a side, 8 to 512 (default 256)')

@@ -10,16 +10,23 @@
     lingo-mi reconstruct large.npy --algorithm fdk --cluster local:3 --out large.ome.zarr
     lingo-mi reconstruct x3d_foot --algorithm best --views 25 --report foot.html
 
-The input is the same as for `lingo-mi fit`. With --complete, the volume is made from the fitted views and from views that the
-fit renders, --views in all. The scan must be on a circle, with an upright panel and no invalid pixel. refined is the best for
-few clean views: it starts from the fit's volume, and fits all views first and then the measured ones. For objects finer than
-the voxels add -D finer=2. With --start, refined or an iterative algorithm starts from the fit's volume and uses the fitted
-views; any scan will do. All but fdk use the poses that the fit has corrected. If the true volume is known, PSNR and SSIM are
-printed twice: the full scale is its largest density, and then 1. best chooses its settings by measured views that it holds out,
-and needs no fit; with -D cloud=true it also fits a cloud, and tries to start from it. Its trials are printed, and written
-beside the volume V.nii.gz as V-plan.json. V-error.nii.gz shows where the volume is least certain, and is a layer of the page
-that --report writes. Beam hardening and scatter that the scene's tube names are taken out of the projections first, unless -D
-effects=ignore is given. With --complete and --start, these are the effects that the fit has modelled.
+The input is the same as for `lingo-mi fit`. If the true volume is known, PSNR and SSIM are printed twice: the full scale is
+its largest density, and then 1.
+
+    --complete   makes the volume from the fitted views and from views that the fit renders, --views in all; the scan must be on
+                 a circle, with an upright panel and no invalid pixel
+    --start      starts refined or an iterative algorithm from the fit's volume, and uses the fitted views of any scan
+    refined      is the best for few clean views; it starts from the fit's volume, and fits all views first and then the measured
+                 ones; for objects finer than the voxels, add -D finer=2
+    best         chooses its settings by measured views that it holds out, and needs no fit; with -D cloud=true, it also fits a
+                 cloud, and tries to start from it
+
+best prints its trials, and writes them beside the volume V.nii.gz as V-plan.json. V-error.nii.gz shows where the volume is least
+certain, and is a layer of the page that --report writes.
+
+All algorithms but fdk use the poses that the fit has corrected. Beam hardening and scatter that the scene's tube names are
+taken out of the projections first, unless -D effects=ignore is given. With --complete and --start, these are the effects that
+the fit has modelled.
 
 A volume larger than memory is made and written in slabs of --slab slices, by fdk, sart, os-sart, sirt, asd-pocs and voxelize.
 Until it is written, the iterative ones hold it in a folder beside it, whose name ends in .slabs. If they are stopped, the same
@@ -70,7 +77,7 @@ IN_SLABS = 'fdk', 'sart', 'os-sart', 'sirt', 'asd-pocs', 'voxelize'  # these nee
 
 
 def parser() -> Parser:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     input_arguments(p)
     p.add_argument('--algorithm', choices=(*ALGORITHMS, 'voxelize'), default='fdk', help='(default: fdk)')
     p.add_argument(

@@ -15,7 +15,6 @@ TABLE.provenance.json beside it says how it was made. --record keeps the numbers
 can be continued on another machine without the checkpoints.
 """
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,7 +27,7 @@ TABLES = 'views', 'ct', 'ablation', 'controls', 'scenes'
 
 
 def parser() -> Parser:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('folder', type=Path, metavar='DIR', help='with pickles NAME_50.pickle, and folders of R2-Gaussian')
     p.add_argument(
         '--tables', nargs='+', choices=TABLES, default=list(TABLES[:3]), metavar='T', help='any of views, ct, ablation, '

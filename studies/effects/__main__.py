@@ -20,7 +20,7 @@ from studies.command import run_study
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument(
         '--only', nargs='+', metavar='NAME', help='effects to measure, by the names of their scenes (default: all)'
     )

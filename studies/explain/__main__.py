@@ -24,7 +24,7 @@ KINDS = 'drift', 'air', 'gain', 'curve', 'scatter'
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('scan', help='a measured scan, views in the order in which they were taken')
     p.add_argument('--views', type=int, default=30, metavar='N', help='evenly spaced views to keep (default 30)')
     p.add_argument('--binning', type=int, default=1, metavar='N', help='N x N pixels, and voxels, as one (default 1)')

@@ -21,7 +21,7 @@ from studies.command import run_study
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('--readers', nargs='+', metavar='NAME', help='readers to test (default: all)')
     p.add_argument('--cases', type=int, default=200, metavar='N', help='cases for every reader (default 200)')
     p.add_argument('--total', type=int, metavar='N', help='cases for all readers together, instead')

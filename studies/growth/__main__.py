@@ -26,7 +26,7 @@ KEYS = 'stage', 'axis', 'number', 'seconds', 'peak', 'commit', 'machine'
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('--large', action='store_true', help='one factor of ten more of voxels, pixels and Gaussians')
     p.add_argument('--out', type=Path, default=Path('out/growth'), metavar='D', help='folder (default: out/growth)')
     docs_arguments(p, 'benchmarks/growth.md', 'figures')

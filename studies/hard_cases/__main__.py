@@ -24,7 +24,7 @@ from studies.command import run_study
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('--markdown', type=Path, metavar='F', help='write the table there, too')
     p.add_argument('--json', type=Path, metavar='F', help='write all numbers there, for --beside')
     p.add_argument('--beside', type=Path, metavar='F', help="show another variant's results in columns of their own")

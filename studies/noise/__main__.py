@@ -20,7 +20,7 @@ from studies.command import run_study, updated_table
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('--objects', nargs='+', default=['foot', 'chest'], metavar='NAME', help='(default: foot chest)')
     p.add_argument(
         '--photons',

@@ -29,7 +29,7 @@ from studies.command import run_study, updated_table
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     input_arguments(p)
     p.add_argument('--views', dest='counts', nargs='+', type=int, default=[30], metavar='N', help='(default: 30)')
     p.add_argument('--methods', nargs='+', metavar='NAME', help='such as fdk best (default: all that are installed)')

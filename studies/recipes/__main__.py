@@ -22,7 +22,7 @@ from studies.command import run_study
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('scenes', nargs='+', type=Path, metavar='SCENE', help='a scene file, or the name of a shipped one')
     p.add_argument(
         '--methods',

@@ -22,7 +22,7 @@ from studies.command import run_study, updated_table
 
 
 def arguments() -> argparse.Namespace:
-    p = Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p = Parser(description=__doc__)
     p.add_argument('--objects', nargs='+', default=['foot', 'chest'], metavar='NAME', help='(default: foot chest)')
     p.add_argument('--finer', nargs='+', type=int, metavar='N', help='(default: 1 2; for measured scans 1)')
     p.add_argument('--views', nargs='+', type=int, default=[25], metavar='N', help='(default: 25)')

@@ -2,6 +2,7 @@
 
 import importlib
 import platform
+import re
 import runpy
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import pytest
 
 from lingo_mi import phantoms
 from lingo_mi.cli import COMMANDS, main
+from lingo_mi.cli.common import Help
 
 ROOT = Path(__file__).parents[2]
 SCRIPTS = ROOT / 'scripts'
@@ -94,6 +96,27 @@ def test_phantom_list(command):
 def test_every_command_describes_itself(command, name):
     code, out, err = command(name, '--help')
     assert code == 0 and out.startswith(f'usage: lingo-mi {name} ') and not err
+
+
+@pytest.mark.parametrize('name', COMMANDS)
+def test_help_fits_a_terminal(command, monkeypatch, name):
+    """Commands may be longer, so that they can be copied, and the choices of an option, which argparse does not break."""
+    monkeypatch.setenv('COLUMNS', '80')
+    lines = command(name, '--help')[1].splitlines()
+    assert not [line for line in lines if len(line) > 80 and not re.search('^ *lingo-mi |{.*}', line)]
+
+
+def test_help_keeps_lists_and_commands():
+    text = 'a text\nof two lines\n\n    one    explains,\n           and goes on\n    two    it\n\n    lingo-mi fit long_name'
+    assert Help('lingo-mi')._fill_text(text, 24, '').split('\n') == [
+        'a text of two lines',
+        '',
+        '    one    explains, and',
+        '           goes on',
+        '    two    it',
+        '',
+        '    lingo-mi fit long_name',
+    ]
 
 
 @pytest.mark.parametrize('path', sorted(SCRIPTS.glob('*.py')), ids=lambda path: path.stem)
