@@ -64,25 +64,25 @@ class Estimate:
 def estimate(
     scan: Scan | Dataset | Geometry, work: Algorithm | Method | str, *, trial: float | None = None
 ) -> Estimate:
-    """Estimate the memory and the time of `lm.reconstruct(scan, work)` or `lm.fit(scan, work)` without doing the work.
+    """Estimate the memory and the time of `lm.reconstruct(scan, work)` or `lm.fit(scan, work)` before the work.
 
     Parameters
     ----------
     scan : Scan, Dataset or Geometry
-        A `Dataset` gives its `train`. A geometry suffices for the memory.
+        Of a `Dataset`, `train` is used. A geometry suffices for the memory.
     work : Algorithm, Method or str
         An algorithm such as `lm.SART()`, a method such as `lm.Fast()`, or a method's name, as `lm.fit` takes it.
     trial : float, optional
-        Seconds for which the work runs on trial, but at least three steps. Its pace gives the time, and its result is discarded.
-        Without a trial the time is unknown, because it differs between machines by a factor of a hundred.
+        The work runs on trial for this many seconds, and for at least three steps. Its pace gives the time, and its result is
+        discarded. Without a trial the time is unknown, because it differs between machines by a factor of a hundred.
 
     Returns
     -------
     Estimate
         `lm.reconstruct`, `lm.fit` and the commands use the same `memory` to refuse work. `seconds` is a range, because later
-        steps may take 0.7 to 1.5 times as long as the tried ones. In fits, `Best` and `PenalisedLeastSquares`, whose steps
-        change, the factor is 0.3 to 4. A trial waits for the device after every step, so steps of a few milliseconds look
-        slower than they are. Work that ends within the trial gives its exact time.
+        steps may take 0.7 to 1.5 times as long as the tried ones. The factor is 0.3 to 4 for fits, `Best` and
+        `PenalisedLeastSquares`, because their steps change. A trial waits for the device after every step, so steps of a few
+        milliseconds look slower than they are. Work that ends within the trial gives its exact time.
 
     Raises
     ------

@@ -55,12 +55,12 @@ def fit(
     Parameters
     ----------
     scan : Scan or Dataset
-        The views to fit. A `Dataset` gives its `train`, and the fit measures its quality on the held-out views and the true
+        The views to fit. Of a `Dataset`, `train` is fitted, and the fit measures its quality on the held-out views and the true
         volume.
     method : Method or str
         `Fast` (the default), `LINGO` or `R2` (published methods), `GaussianSplatting` or `XGaussian` (baselines that use alpha
-        compositing, and so make views but no volume), `NAF` (a neural field), or a method that you wrote. A text names the method
-        and its options: 'lingo:V_S=1'.
+        compositing, and so make views but no volume), `NAF` (a neural field), or a method that you wrote. A string names the
+        method and its options: 'lingo:V_S=1'.
     hold_out : int or None
         One view in `hold_out` is not fitted, and measures how well the fit predicts unseen views. 0 fits all views. The default
         is 10 for a `Dataset` of 20 views or more that has neither held-out views nor a true volume, and otherwise 0.
@@ -79,7 +79,8 @@ def fit(
     progress : bool or callable
         Whether to show a progress bar on standard error, or a function that `fitting.loop.run` calls between steps.
     live : bool
-        Serve a page that grows while the fit runs, to this machine alone. The fit prints its address; a notebook shows the page.
+        Serve a page that grows while the fit runs. Only this machine can open it. The fit prints its address; a notebook shows
+        the page.
     log_dir : path, optional
         A folder for TensorBoard's events: numbers, slices, views (needs the extra 'tensorboard').
     cluster : str or Client, optional

@@ -85,7 +85,7 @@ def reconstruct(
     Parameters
     ----------
     scan : Scan or Dataset
-        Projections and geometry. A `Dataset` gives its `train`. The effects that the scan names are corrected first: beam
+        Projections and geometry. Of a `Dataset`, `train` is used. The effects that the scan declares are corrected first: beam
         hardening, scatter, dead pixels, and blur if there is scatter or a fit to start from. `dataclasses.replace(scan,
         effects=None)` treats the projections as line integrals.
     algorithm : Algorithm
@@ -94,9 +94,9 @@ def reconstruct(
     start : Fit or array, optional
         A fit to this scan, or a volume [x, y, z] in 1/mm, to start from. `Refined` needs one.
     views : int, optional
-        How many views to reconstruct from, with a fit as `start`. The fit only renders the views that were not measured
-        (the second stage of the paper), and the volume starts empty. The scan must be on a circle. `Refined` uses these views
-        first, and then the measured ones. Without `views`, it uses the measured ones alone.
+        How many views to reconstruct from, with a fit as `start`. The fit only renders the views that were not measured (the
+        second stage of the paper), and the volume starts empty, except for `Refined`. The scan must be on a circle. `Refined`
+        uses these views first, and then the measured ones. Without `views`, it uses the measured ones alone.
     out : path, optional
         Write the volume there (.nii, .nii.gz, .ome.zarr or .dicom), as `Reconstruction.save` does.
     units, mu_water

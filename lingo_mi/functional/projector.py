@@ -33,8 +33,7 @@ class Projector(LinearMap):
     """A: line integrals of a voxel volume in the views of a scan. A.T: backprojection, the transpose of A.
 
     `A(volume)` takes densities [x, y, z], per mm, and returns line integrals [view, v, u] without a unit. `A.T(projections)`
-    returns a number for each voxel: the sum over all pixels of the pixel's value times the weight of the voxel in the pixel's
-    line integral, in mm.
+    returns a number for each voxel: the sum of all pixels' values, each times the voxel's weight in that line integral, in mm.
     A.T is the transpose of A to rounding. Both take and return arrays of NumPy, Dr.Jit, PyTorch or JAX, with leading batch axes,
     and are differentiable in them. Computation is in float32.
 
@@ -45,9 +44,9 @@ class Projector(LinearMap):
     geometry : Geometry
         The scanner and the grid of the volume.
     model : {'joseph', 'exact'}
-        'joseph' interpolates in the slices of voxel centres (error about 0.5 % of the line integrals). 'exact' integrates the
-        trilinear interpolant exactly, and takes 2 to 8 times as long. If the source is beside or inside the volume, the model
-        is always 'exact'.
+        'joseph' samples each ray once a slice of voxels, and interpolates there (error about 0.5 % of the line integrals).
+        'exact' integrates the trilinear interpolant exactly, and takes 2 to 8 times as long. If the source is beside or inside
+        the volume, the model is always 'exact'.
     views : slice or sequence of int, optional
         Views of the geometry (default: all).
     valid : array of bool, optional

@@ -64,20 +64,20 @@ class ConeNumbers(Placement):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Geometry(ABC):
-    """The geometry of a scan, and the voxels to reconstruct.
+    """The geometry of a scan, and the voxels to reconstruct. Make one with `cone`, `parallel` or a `from_...` method.
 
     Parameters
     ----------
     mode : str
         'cone' or 'parallel'.
     nDetector : [2]
-        Pixels (v, u), rows and columns, at least 1. One number here, in dDetector or offDetector holds for both axes.
+        Pixels (v, u), rows and columns, at least 1. One number, here or in dDetector and offDetector, holds for both axes.
     dDetector : [2]
         Pixel size, (v, u), mm.
     grid : Grid
         The voxels.
     angles : [n]
-        Direction to the source, seen from above, radians.
+        Direction to the source, counter-clockwise seen from above, radians.
     DSO, DSD : float
         Distances from the source to the axis and to the panel, mm.
 

@@ -133,18 +133,18 @@ class Best(Algorithm):
 
     1. One view in `held_out` is held out. `ASDPOCS` reconstructs from the others. After every pass, the volume's projections are
        compared with the held-out views (`held_out.Score`). The passes end when they no longer predict these views better.
-    2. Steps as in `Refined` follow (changes weighted by `structure`, corrections for the error of Joseph's projector), but
-       over-relaxed, on the scan's voxels and on `finer` times smaller ones. If passes after the first one gain little, noise
-       limits them, and `Best` tries more total variation.
+    2. Over-relaxed steps of `Refined` follow (changes weighted by `structure`, corrections for the error of Joseph's projector),
+       on the scan's voxels and on `finer` times smaller ones. If passes after the first one gain little, noise limits them, and
+       `Best` tries more total variation.
     3. With `prior`, it tries `PenalisedLeastSquares`, and the held-out views choose the strength. With `cloud`, it fits a cloud
-       of Gaussians to the other views, and tries the best of these refinements from the cloud's volume.
+       of Gaussians to the views that are not held out, and tries the best of these refinements from the cloud's volume.
     4. `ASDPOCS` and `SART` get all their passes, unless a refinement is already far ahead of `ASDPOCS`.
     5. The setting that predicts the held-out views best, with its number of passes, is applied to all views.
 
     Smaller voxels suit objects finer than the voxels, because the scan's voxels turn such detail into streaks. Streaks lie along
-    the views of the reconstruction, and held-out views hardly show them. The scan's own voxels must therefore be better by
-    `MARGIN`. `SART` and `ASDPOCS`, which leave more streaks and noise than a refinement, must be better by `PLAIN`, unless
-    `voxels` is 'values', whose purpose is to predict views.
+    the views of the reconstruction, and held-out views hardly show them. The scan's own voxels must therefore be 2 % better.
+    `SART` and `ASDPOCS`, which leave more streaks and noise than a refinement, must be 1.5 % better, unless `voxels` is 'values',
+    whose purpose is to predict views.
 
     Parameters
     ----------

@@ -38,17 +38,18 @@ WEIGHTS = 'known', 'photons', 'equal'
 class PenalisedLeastSquares(Algorithm):
     """Least squares with a prior: minimises 1/2 (A x - b)^T W (A x - b) + strength max(A^T W b) R(x) over 0 <= x <= `upper`.
 
-    The proximal map of the prior follows each step of gradient descent, whose length is 1 / |A^T W A|. The gradient of a prior's
-    smooth part is added to the gradient of the data term. Nesterov's momentum accelerates the steps (FISTA), and is
-    reset when it points uphill.
+    R is the prior. Its proximal map follows each step of gradient descent, whose length is 1 / |A^T W A|. The gradient of a
+    prior's smooth part is added to the gradient of the data term. Nesterov's momentum accelerates the steps (FISTA), and is reset
+    when it points uphill.
 
     Parameters
     ----------
     prior : Prior
         `TV` (total variation), another one of `lingo_mi.reconstruction.priors`, or one that you wrote.
     strength : float, optional
-        Strength of the prior relative to max(A^T W b), so that it does not depend on units. None: the strongest of `PATH` that
-        predicts held-out views nearly as well as the best one (`held_out.Score`), in up to three times the time.
+        Strength of the prior relative to max(A^T W b), so that it does not depend on units. None: of six strengths from 1e-2 to
+        3e-5, the strongest that predicts held-out views nearly as well as the best one (`held_out.Score`). The search takes up to
+        three times as long.
     niter : int
         Iterations, at least 1. Each takes one projection and one backprojection of all views.
     upper : float, optional

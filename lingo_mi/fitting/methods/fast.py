@@ -24,13 +24,13 @@ class Fast(DensityMethod):
     - Within the masks, Gaussians start on the edges of a quick reconstruction, and their densities are the densities of its
       voxels.
     - Beside L1, the loss has the gradient of the difference, which restores fine detail sooner, and more weight on SSIM.
-    - Rates are 3 to 40 times higher and fall over the run. The second moment has a shorter memory, the first one is Nesterov's,
-      and the result is the mean of the last steps.
+    - Rates are 3 to 40 times those of `LINGO`, and fall over the run. Adam's second moment has a shorter memory, its first one is
+      Nesterov's, and the result is the mean of the last steps.
     - Successive views lie well apart.
     - The total variation covers eight times the volume, since with a short memory each Gaussian must be smoothed more often than
       once in 64 steps. With more views it weighs less.
-    - Densification starts early, and the scan's size limits it. The loss scale, about 2 with `normalise`,
-      multiplies the gradients, and the threshold makes up for it.
+    - Densification starts early, and the scan's size limits it. The loss scale, about 2 with `normalise`, multiplies the
+      gradients, so the threshold is higher.
     - The fit stops early if the scan says how many photons a pixel counts.
 
     It has the options of `DensityMethod`.

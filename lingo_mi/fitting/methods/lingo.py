@@ -15,8 +15,8 @@ from lingo_mi.fitting.start.start import Start
 class LINGO(DensityMethod):
     """LINGO, the published method: Otsu masks of all views for a start, and R2-Gaussian's fit with a dynamic loss scale.
 
-    It has the options of `DensityMethod`. In the paper, the density of a Gaussian is its mean pixel;
-    `density` of `MaskStart` offers others.
+    It has the options of `DensityMethod`. The paper takes the mean pixel as the density of a Gaussian (`density='paper'`). The
+    default `density='lsq'` of `MaskStart` also multiplies it by a fitted factor.
 
     References
     ----------
