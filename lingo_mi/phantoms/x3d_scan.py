@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from lingo_mi.common.errors import InputError
+from lingo_mi.common.runtime import ensure_variant
 from lingo_mi.geometry import CircularGeometry, Geometry
 from lingo_mi.geometry.trajectories import circular
 from lingo_mi.phantoms import Phantom
@@ -74,6 +75,7 @@ def scan(
     """
     if views < 1:
         raise InputError(f'a scan needs at least one view, not {views}')
+    ensure_variant()
     angles = np.concatenate([circular(views, 180.0), np.sort(np.random.default_rng(seed).uniform(0, np.pi, views))])
     geometry = default_geometry(phantom, angles, pixels)
     both = Scan(geometry, project_phantom(phantom, geometry, progress))

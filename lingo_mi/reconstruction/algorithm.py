@@ -166,6 +166,11 @@ class Algorithm(ABC):
         """The largest number of steps, for `progress`."""
         return self.options['niter']
 
+    @property
+    def volumes(self) -> float:
+        """Peak memory besides the algorithm's `memory_needs.NEEDS`, in volumes on `grid`."""
+        return 0.0
+
     def grid(self, geometry: Geometry) -> Grid:
         """The voxels that the algorithm works on. The result has the geometry's own voxels."""
         return geometry.grid

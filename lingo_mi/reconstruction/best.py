@@ -215,6 +215,10 @@ class Best(Algorithm):
     def grid(self, geometry: Geometry) -> Grid:
         return geometry.grid.finer(self.finer)
 
+    @property
+    def volumes(self) -> float:
+        return 0.0 if self.prior is None else self._penalised(None).volumes / self.finer**3
+
     def _run(
         self, scan: Scan, *, start: ArrayLike | None = None, progress: Progress | None = None, fit: Fit | None = None
     ) -> Chosen:

@@ -146,7 +146,9 @@ def check_room(
 
 def room_needed(geometry: Geometry, algorithm: Algorithm, views: int, beside: float = 0) -> float:
     """Bytes of peak memory by which `check_room` refuses, whose arguments these are."""
-    return memory_needed(algorithm.name, geometry.on(algorithm.grid(geometry)), views) + beside
+    geometry = geometry.on(algorithm.grid(geometry))
+    more = 4 * algorithm.volumes * math.prod(geometry.grid.shape)
+    return memory_needed(algorithm.name, geometry, views) + more + beside
 
 
 @contextmanager

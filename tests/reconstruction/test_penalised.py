@@ -126,6 +126,11 @@ def test_bounds_and_finer_voxels(scan):
     fine = lm.reconstruct(scan, lm.PenalisedLeastSquares(strength=1e-4, niter=10, finer=2), start=truth, progress=False)
     assert fine.volume.shape == truth.shape and fine.grid == scan.geometry.grid
     assert fine.metrics(truth)['psnr_3d'] > 25
+    parts = np.kron(truth, np.ones((2, 2, 2), np.float32))
+    same = lm.reconstruct(scan, lm.PenalisedLeastSquares(strength=1e-4, niter=10, finer=2), start=parts, progress=False)
+    np.testing.assert_array_equal(same.volume, fine.volume)
+    with pytest.raises(InputError, match=r'the start volume: shape \(3, 3\)'):
+        lm.reconstruct(scan, lm.PenalisedLeastSquares(finer=2), start=np.ones((3, 3)), progress=False)
 
 
 def test_a_denoiser_is_a_prior(scan):
@@ -142,6 +147,58 @@ def test_a_denoiser_is_a_prior(scan):
     plain = lm.reconstruct(scan, lm.PenalisedLeastSquares(strength=0.0, niter=30), progress=False)
     assert result.metrics(truth)['psnr_3d'] > plain.metrics(truth)['psnr_3d'] + 1
     assert len(strengths) == 30 and len(set(strengths)) == 1
+
+
+def in_place(volume, strength):
+    volume *= 0.5
+    return volume
+
+
+def test_a_denoiser_may_work_in_place(scan):
+    """In a sum, other priors use the same volume."""
+    volumes = [
+        lm.reconstruct(
+            scan[0],
+            lm.PenalisedLeastSquares(lm.PriorSum((lm.Denoiser(f), TV())), strength=1e-4, niter=3),
+            progress=False,
+        ).volume
+        for f in (in_place, lambda v, s: 0.5 * v)
+    ]
+    np.testing.assert_array_equal(*volumes)
+
+
+class Wrong(lm.Prior):
+    """A prior whose map returns something else."""
+
+    def __init__(self, returned):
+        self.returned = returned
+
+    def prox(self, x, strength, size, upper=np.inf):
+        return self.returned(x)
+
+
+@pytest.mark.parametrize(
+    'returned, message',
+    [
+        (lambda x: mi.Float([1, 2]), 'the prior Wrong: prox returns 2 of 32768 voxels'),
+        (lambda x: x * np.nan, 'the prior Wrong returns NaN or infinity'),
+    ],
+)
+def test_priors_that_fail(scan, returned, message):
+    with pytest.raises(InputError, match=message):
+        lm.reconstruct(scan[0], lm.PenalisedLeastSquares(Wrong(returned), strength=1e-4), progress=False)
+
+
+def test_priors_that_need_more_memory(scan):
+    """TGV holds three fields and six slopes, and a sum holds the state of all parts."""
+
+    def memory(*priors, finer=1):
+        return lm.estimate(scan[0], lm.PenalisedLeastSquares(lm.PriorSum(priors), finer=finer)).memory
+
+    assert memory(TV()) < memory(lm.TGV()) < memory(lm.TGV(), TV()) < memory(lm.TGV(), lm.TGV())
+    assert memory(lm.TGV(), finer=2) > 6 * memory(lm.TGV())
+    best = [lm.estimate(scan[0], lm.Best(finer=1, prior=prior)).memory for prior in (None, TV(), lm.TGV())]
+    assert best == sorted(best) and best[0] < best[1] < best[2]
 
 
 @pytest.mark.parametrize(

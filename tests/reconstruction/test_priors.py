@@ -262,6 +262,7 @@ def test_a_sum_of_one_and_of_gradients(noisy):
         (lambda: PriorSum((TV(), 3)), 'priors must be a Prior, not int'),
         (lambda: PriorSum((TV(),), weights=(1, 2)), 'one for each of the 1 priors, not 2'),
         (lambda: PriorSum((TV(),), weights=(0,)), 'weights must be above 0'),
+        (lambda: PriorSum((TV(),), weights=1), 'weights must be a Sequence or a ndarray'),
     ],
 )
 def test_bad_options(make, message):

@@ -8,7 +8,9 @@ import pytest
 
 from lingo_mi.geometry import CircularGeometry, Grid
 from lingo_mi.geometry.trajectories import circular
+from lingo_mi.reconstruction import ALGORITHMS
 from lingo_mi.reconstruction.memory_needs import NEEDS, memory_needed
+from lingo_mi.reconstruction.run import room_needed
 
 # Not `resource`, whose maximum begins with the maximum of the parent process.
 pytestmark = pytest.mark.skipif(not Path('/proc/self/status').exists(), reason='asks Linux for its peak memory')
@@ -71,7 +73,8 @@ def taken(algorithm, *sizes):
         [sys.executable, '-c', PROGRAM, algorithm, *map(str, sizes)], capture_output=True, text=True, check=True
     ).stdout
     before, peak = (1024 * int(word) for word in out.split())
-    expected = memory_needed(algorithm, scanned(*sizes), sizes[2])
+    how = ALGORITHMS[algorithm](**dict(finer=1) if algorithm == 'best' else {})
+    expected = room_needed(scanned(*sizes), how, sizes[2])
     print(f'{algorithm} {sizes}: {peak / 1e9:.2f} GB, {(peak - before) / expected:.2f} of what is expected')
     return (peak - before) / expected, peak
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import inf
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import numpy as np
@@ -44,6 +44,7 @@ class Denoiser(Prior):
     """
 
     function: Callable[[np.ndarray, float], Any]
+    volumes: ClassVar[float] = 4.0  # the function may take more
 
     def __post_init__(self):
         if not callable(self.function):
@@ -53,7 +54,7 @@ class Denoiser(Prior):
 
     def prox(self, x, strength, size, upper=inf):
         try:
-            denoised = self.function(x.numpy().reshape(size), strength)
+            denoised = self.function(x.numpy().reshape(size).copy(), strength)  # which may work in place
         except Exception as error:
             raise InputError(f'the denoiser fails: {type(error).__name__}: {error}'.splitlines()[0]) from error
         volume = as_numpy(denoised, 'what the denoiser returns', np.float32)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import inf
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -50,6 +50,7 @@ class TGV(Prior):
 
     second: float = 2.0
     inner: int = 10
+    volumes: ClassVar[float] = 36.0
 
     def __post_init__(self):
         check_counts(inner=self.inner)

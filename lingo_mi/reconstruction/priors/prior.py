@@ -21,6 +21,9 @@ class Prior:
     ----------
     curvature : float
         A bound on the second derivatives of the smooth part, mm, or 0 without a smooth part.
+    volumes : float
+        Peak memory of `prox` and `gradient` besides their argument and result, in volumes. By it, a reconstruction refuses to
+        start.
 
     Examples
     --------
@@ -33,6 +36,7 @@ class Prior:
     """
 
     curvature: float = 0.0
+    volumes: float = 0.0
 
     def prox(self, x: mi.Float, strength: float, size: tuple[int, int, int], upper: float = inf) -> mi.Float:
         """The z in [0, upper] that minimises 1/2 |z - x|^2 + strength R(z), R without its smooth part.

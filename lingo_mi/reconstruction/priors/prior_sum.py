@@ -9,6 +9,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from lingo_mi.common.errors import InputError, require_type
 from lingo_mi.reconstruction.parameters import check_counts
@@ -58,6 +59,8 @@ class PriorSum(Prior):
             raise InputError('priors: give at least one')
         for prior in self.priors:
             require_type('priors', prior, Prior, 'such as lm.TV()')
+        if self.weights is not None:
+            require_type('weights', self.weights, (Sequence, np.ndarray), 'such as (1, 0.5)')
         weights = (1.0,) * len(self.priors) if self.weights is None else tuple(self.weights)
         if len(weights) != len(self.priors):
             raise InputError(f'weights must be one for each of the {len(self.priors)} priors, not {len(weights)}')
@@ -65,6 +68,8 @@ class PriorSum(Prior):
             check_positive('weights', weight)
         self._parts = list(zip(self.priors, weights))
         self.curvature = sum(weight * prior.curvature for prior, weight in self._parts)
+        each = [prior.volumes for prior in self.priors]
+        self.volumes = (max(each) + sum(each)) / 2 + 2 * len(each)  # about half of it stays while another prior works
         self.begin()
 
     def begin(self) -> None:

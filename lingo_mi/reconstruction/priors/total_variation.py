@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from math import inf
 from numbers import Real
-from typing import Any
+from typing import Any, ClassVar
 
 import drjit as dr
 import mitsuba as mi
@@ -46,6 +46,7 @@ class TV(Prior):
     """
 
     inner: int = 8
+    volumes: ClassVar[float] = 9.0
 
     def __post_init__(self):
         check_counts(inner=self.inner)
