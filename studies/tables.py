@@ -4,9 +4,9 @@
     python -m studies.tables ct --objects foot chest --views 25
     python -m studies.tables ablation --scale paper
 
-Objects are the phantoms foot and chest and the volumes aneurism, engine, teapot, tooth, chest_lidc0314, abdomen_ts, aorta_ts,
-head_fsrt and jaw_fsrt, as NAME.nii.gz in the folder that LINGO_MI_DATA names; those that are missing are skipped. From X3D's own
-scans, `lingo-mi x3d` makes the tables.
+Objects are the phantoms foot, chest and shepp_logan and the volumes aneurism, engine, teapot, tooth, chest_lidc0314,
+abdomen_ts, aorta_ts, head_fsrt and jaw_fsrt, as NAME.nii.gz in the folder that LINGO_MI_DATA names; those that are missing are
+skipped. From X3D's own scans, `lingo-mi x3d` makes the tables.
 
 views and ct are Tables 1 and 2 of the paper, ablation is Table 3. controls are further rows of it, which separate what the loss
 scale does from the larger number of Gaussians that it causes.

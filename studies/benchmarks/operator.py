@@ -2,11 +2,15 @@
 
     python -m studies.benchmarks.operator --out docs/tables
     python -m studies.benchmarks.operator --overhead
+    python -m studies.benchmarks.operator --on-device --variant cuda_ad_mono
 
 A cone beam of one turn before a flat panel. Every package that is installed is measured in the same process, from an array of
 NumPy to an array of NumPy. CPU seconds are summed over all threads of the process: they give the cost of a call even if others
 use the machine. The first call, which compiles, is not counted. Packages that take seconds a view are called once on one view,
 and the seconds are scaled to all. The adjoint's error is |<A x, y> - <x, A.T y>| / (|A x| |y|) for random x and y, in float64.
+
+`--on-device` measures our operators alone, from arrays of Dr.Jit to arrays of Dr.Jit, which stay on the device. The clocks are
+read when the device has finished its work.
 
 `--overhead` takes a scan so small that its kernels take about a millisecond, in one thread. It compares calls through arrays of
 NumPy, Dr.Jit, PyTorch and JAX with the bare kernels: the least CPU seconds over all turns, since others on the machine hardly
@@ -63,8 +67,8 @@ class Pair:
         The other way.
     """
 
-    forward: Callable[[np.ndarray], np.ndarray]
-    adjoint: Callable[[np.ndarray], np.ndarray]
+    forward: Callable[[Any], Any]
+    adjoint: Callable[[Any], Any]
 
 
 def ours(geometry: Geometry, model: str) -> Pair:
@@ -145,6 +149,7 @@ OPERATORS: dict[str, tuple[str, Callable[[Geometry], Pair], bool]] = {
     'diffct, PyTorch': ('diffct', diffct, True),
     'torchtomo, PyTorch': ('torchtomo', torchtomo, True),
 }
+OURS = [name for name, (package, _, _) in OPERATORS.items() if package == 'lingo_mi']
 
 
 def scan(size: int, pixels: int, views: int) -> Geometry:
@@ -160,8 +165,8 @@ def scan(size: int, pixels: int, views: int) -> Geometry:
     )
 
 
-def measured(geometry: Geometry, name: str, repeats: int) -> dict[str, Any] | None:
-    """A row of the table; None if the package is not installed."""
+def measured(geometry: Geometry, name: str, repeats: int, on_device: bool = False) -> dict[str, Any] | None:
+    """A row of the table; None if the package is not installed. on_device: from arrays of Dr.Jit, which only ours takes."""
     package, make, slow = OPERATORS[name]
     part = geometry.subset([0]) if slow else geometry
     try:
@@ -171,9 +176,9 @@ def measured(geometry: Geometry, name: str, repeats: int) -> dict[str, Any] | No
     rng = np.random.default_rng(0)
     x = rng.random(part.grid.shape, np.float32)
     y = rng.random((len(part), *part.nDetector), np.float32)
-    calls = 1 if slow else 1 + repeats
-    ax, forward = _timed(pair.forward, x, calls)
-    aty, adjoint = _timed(pair.adjoint, y, calls)
+    calls, array = 1 if slow else 1 + repeats, mi.TensorXf if on_device else np.asarray
+    ax, forward = _timed(pair.forward, array(x), calls)
+    aty, adjoint = _timed(pair.adjoint, array(y), calls)
     error = abs(np.vdot(ax, y) - np.vdot(x, aty)) / (np.linalg.norm(ax) * np.linalg.norm(y))
     (cpu, wall), (cpu_t, wall_t) = len(geometry) / len(part) * np.array([forward, adjoint])
     return dict(zip(COLUMNS, (name, _version(package), len(part), cpu, cpu_t, wall, wall_t, error)))
@@ -187,10 +192,14 @@ def _timed(function, argument, calls: int) -> tuple[np.ndarray, np.ndarray]:
     """The result, float64, and a call's CPU and wall seconds: medians without the first call, if there are several."""
     taken = []
     for _ in range(calls):
+        dr.eval(argument)
+        dr.sync_thread()
         cpu, wall = time.process_time(), time.perf_counter()
         result = function(argument)
+        dr.eval(result)
+        dr.sync_thread()
         taken.append((time.process_time() - cpu, time.perf_counter() - wall))
-    return result.astype(float), np.median(taken[-max(1, calls - 1) :], axis=0)
+    return np.array(result, float), np.median(taken[-max(1, calls - 1) :], axis=0)
 
 
 def overhead(geometry: Geometry, turns: int) -> Iterator[tuple[str, float, float]]:
@@ -232,21 +241,28 @@ def main() -> None:
     p.add_argument('--pixels', type=int, default=256, help='pixels along a side')
     p.add_argument('--views', type=int, default=30)
     p.add_argument('--repeats', type=int, default=3, help='calls whose median is taken')
-    p.add_argument('--only', nargs='+', choices=list(OPERATORS), default=list(OPERATORS), help='operators')
+    p.add_argument('--only', nargs='+', choices=list(OPERATORS), help='operators (default: all that can be measured)')
     p.add_argument('--out', type=Path, help='a folder, for operator.csv and its provenance')
+    p.add_argument('--variant', help='Mitsuba variant of ours (default: cuda_ad_mono, else llvm_ad_mono)')
+    p.add_argument('--on-device', action='store_true', help='measure ours alone, between arrays of Dr.Jit')
     p.add_argument(
         '--overhead', action='store_true', help='measure a call over its kernel, on a small scan, in place of the table'
     )
     args = p.parse_args()
-    use_variant()
+    only = args.only or (OURS if args.on_device else list(OPERATORS))
+    if args.on_device and not {*only} <= {*OURS}:
+        p.error(f'argument --on-device: only {" and ".join(OURS)} take arrays of Dr.Jit')
+    use_variant(args.variant)
     use_threads(1 if args.overhead else cores())
     if args.overhead:
         for name, forward, adjoint in overhead(scan(16, 16, 4), 50 * args.repeats):
             print(f'{name:12} A {1e3 * forward:6.2f} ms, A.T {1e3 * adjoint:6.2f} ms')
         return
+    if args.out:
+        args.out.mkdir(parents=True, exist_ok=True)
     geometry, rows = scan(args.size, args.pixels, args.views), []
-    for name in args.only:
-        row = measured(geometry, name, args.repeats)
+    for name in only:
+        row = measured(geometry, name, args.repeats, args.on_device)
         if row is None:
             print(f'{name}: not installed, left out')
             continue

@@ -50,7 +50,11 @@ def main() -> int:
 
     beside = stored(args.beside) if args.beside else None
     cases = [case for case in all_cases(steps=args.steps) if not any(text in case.name for text in args.without)]
-    results = [(case, measure(case)) for case in cases]
+    results = []
+    for case in cases:
+        results.append((case, measure(case)))
+        if args.json:  # after every case, so that a run that is stopped leaves what it has measured
+            store(args.json, variant, results)
     missed = [(case.name, wrong) for case, result in results if (wrong := miss(case, result, variant))]
     if beside:
         missed += [(f'{name}, {beside.title}', wrong) for name, wrong in beside.misses(cases).items()]
@@ -61,8 +65,6 @@ def main() -> int:
     if args.markdown:
         write_text(args.markdown, table)
         write_provenance(args.markdown)
-    if args.json:
-        store(args.json, variant, results)
     return int(bool(missed))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,7 @@ from lingo_mi.files.r2 import META
 from lingo_mi.files.volumes import read_volume
 from lingo_mi.storage.output_folder import digest
 
-PHANTOMS = 'foot', 'chest'
+PHANTOMS = 'foot', 'chest', 'shepp_logan'
 VOLUMES = ('aneurism', 'engine', 'teapot', 'tooth', 'chest_lidc0314', 'abdomen_ts', 'aorta_ts', 'head_fsrt', 'jaw_fsrt')
 
 
@@ -92,7 +93,7 @@ def load_object(name: str, size: int) -> phantoms.Phantom:
         If its file cannot be read.
     """
     if name in PHANTOMS:
-        return phantoms.make(name, size)
+        return replace(phantoms.make(name, size), analytic=None)  # like the volumes, projected as voxels
     path = _file(name)
     if path is None:
         raise InputError(f'object {name!r}: let LINGO_MI_DATA name the folder of {name}.nii.gz')
