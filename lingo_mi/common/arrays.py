@@ -27,12 +27,17 @@ def as_numpy(values: Any, name: str, dtype: DTypeLike | None = None) -> np.ndarr
     Raises
     ------
     InputError
-        If they are not an array of real numbers, or if NumPy cannot reach the array, such as a PyTorch tensor on a GPU.
+        If they are not an array of real numbers, or if NumPy cannot reach the array, such as a PyTorch tensor on a GPU. Also if
+        some are masked, because the mask would be lost.
 
     Examples
     --------
     >>> as_numpy(torch.zeros(3), 'the projections', np.float32)
     """
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+        raise InputError(
+            f'{name}: some values are masked, and the mask would be lost: fill them first, as by filled(0)'
+        )
     try:
         if hasattr(values, '__dlpack__') and not hasattr(values, '__array__'):
             values = np.from_dlpack(values)

@@ -58,9 +58,11 @@ def call(function: Callable[..., Any], arguments: Sequence[Argument], shape: tup
     Raises
     ------
     InputError
-        For arrays of several kinds, of other shapes, or on a device that the active variant does not use.
+        For arrays of several kinds, of other shapes, or on a device that the active variant does not use; see `require_dense`.
     """
     kind = _kind(arguments, name)
+    for argument in arguments:
+        require_dense(argument.array, kind, name)
     if kind == 'NumPy':
         arguments = [_on_host(a, name) for a in arguments]
     _check_shapes(arguments, name)
@@ -108,6 +110,26 @@ def framework_of(array) -> str:
         return 'Dr.Jit'
     packages = {base.__module__.partition('.')[0] for base in type(array).__mro__}
     return 'PyTorch' if 'torch' in packages else 'JAX' if packages & {'jax', 'jaxlib'} else 'NumPy'
+
+
+def require_dense(array: Any, kind: str, name: str) -> None:
+    """Raises InputError for an array of PyTorch or JAX that is sparse, nested or complex; NumPy's are checked by `as_numpy`.
+
+    Parameters
+    ----------
+    kind : str
+        See `framework_of`.
+    name : str
+        Name of the caller, for the message.
+    """
+    if kind == 'PyTorch' and array.is_nested:  # it has no shape
+        raise InputError(f'{name} takes dense tensors, not nested ones: stack their parts first')
+    if kind == 'PyTorch' and str(array.layout) != 'torch.strided':
+        raise InputError(f'{name} takes dense tensors, not {array.layout}: call to_dense() first')
+    if kind == 'JAX' and hasattr(array, 'todense'):
+        raise InputError(f'{name} takes dense arrays, not {type(array).__name__}: call todense() first')
+    if kind in ('PyTorch', 'JAX') and 'complex' in str(array.dtype):
+        raise InputError(f'{name} takes real numbers, not {array.dtype}')
 
 
 def _check_shapes(arguments: Sequence[Argument], name: str):

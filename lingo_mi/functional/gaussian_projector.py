@@ -132,7 +132,7 @@ class GaussianProjector(LinearMap):
             dr.backward(self._image(density, view, primal=False) * upstream)
             out += dr.grad(density)
             dr.eval(out)
-        return out
+        return dr.select(dr.any(dr.isnan(y)), dr.nan, out)  # Dr.Jit's sums leave NaN out on a CPU
 
     def _image(self, density: Any, view: View, primal: bool = True) -> Any:
         centre, scale, rotation = self._cloud()

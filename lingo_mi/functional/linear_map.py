@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from numbers import Real
 from typing import Any
 
 import drjit as dr
@@ -12,11 +13,12 @@ import numpy as np
 from scipy.sparse.linalg import LinearOperator, eigsh
 
 from lingo_mi.common.arrays import as_numpy
-from lingo_mi.common.errors import InputError
+from lingo_mi.common.errors import InputError, shown
 from lingo_mi.common.memory import room
 from lingo_mi.common.runtime import drjit_lock, ensure_variant
-from lingo_mi.functional.frameworks import framework_of
+from lingo_mi.functional.frameworks import framework_of, require_dense
 from lingo_mi.projectors.upload import uploaded
+from lingo_mi.projectors.usable import require_unfrozen
 
 LARGE = 2**26  # bytes: only larger results are checked to fit, since the check reads files for half a millisecond
 BASIS, FEW = 12, 4  # vectors of the Krylov space for an accurate norm, and for a rough one
@@ -29,10 +31,13 @@ class LinearMap(ABC):
     ----------
     domain_shape, range_shape : tuple of int
         Shapes of its argument and of its result.
+    counted : array of bool or True
+        Numbers of the argument that add to the result. Others may be NaN.
     """
 
     domain_shape: tuple[int, ...]
     range_shape: tuple[int, ...]
+    counted: np.ndarray | bool = True
     __array_ufunc__ = None  # `A @ array` is an error, not an array of single views
 
     @property
@@ -52,21 +57,24 @@ class LinearMap(ABC):
         Raises
         ------
         InputError
-            For an array of another shape, or with NaN or infinity, or if the result does not fit into memory.
+            For an array of another shape, or with NaN or infinity, or if the result does not fit into memory. Gradients that
+            flow back may have NaN and infinity.
         """
-        kind = framework_of(x)
+        kind, name = framework_of(x), repr(self)
+        require_unfrozen(name)
+        require_dense(x, kind, name)
         if kind == 'NumPy':
-            x = as_numpy(x, f'the argument of {self!r}', np.float32)
+            x = as_numpy(x, f'the argument of {name}', np.float32)
         shape = tuple(x.shape)
         if kind == 'Dr.Jit' and not dr.is_tensor_v(x):  # a flat array stands for one
             shape = self.domain_shape if shape == (math.prod(self.domain_shape),) else shape
         if shape[len(shape) - len(self.domain_shape) :] != self.domain_shape:
-            raise InputError(f'{self!r} takes arrays [..., {_text(self.domain_shape)}], not [{_text(shape)}]')
+            raise InputError(f'{name} takes arrays [..., {_text(self.domain_shape)}], not [{_text(shape)}]')
         batch = shape[: len(shape) - len(self.domain_shape)]
         needed = 4 * math.prod((*batch, *self.range_shape))
         if needed > LARGE and needed > room():
             shape = _text((*batch, *self.range_shape))
-            raise InputError(f'{self!r}: a result [{shape}] does not fit into memory: take fewer views or voxels')
+            raise InputError(f'{name}: a result [{shape}] does not fit into memory: take fewer views or voxels')
         if kind == 'NumPy':
             return self.on_host(x)
         if kind == 'Dr.Jit':
@@ -82,8 +90,8 @@ class LinearMap(ABC):
 
     def on_host(self, x: np.ndarray, checked: bool = True) -> np.ndarray:
         """The map of NumPy's array. checked: whether NaN is an error."""
-        if checked and not np.isfinite(x).all():
-            raise InputError(f'{self!r}: the array has NaN or infinity as float32: replace those values first')
+        if checked:
+            self.require_finite(np.isfinite(x))
         batch = x.shape[: x.ndim - len(self.domain_shape)]
         out = np.empty((*batch, *self.range_shape), np.float32)
         with drjit_lock():
@@ -92,14 +100,20 @@ class LinearMap(ABC):
                 out[i] = self.on_device(uploaded(x[i])).numpy().reshape(self.range_shape)
         return out
 
+    def require_finite(self, finite: np.ndarray) -> None:
+        """Raises InputError unless all numbers of an argument that count are finite. finite: which are, in any shape."""
+        if not (finite.all() or finite.reshape(-1, *self.domain_shape).all(where=self.counted)):
+            raise InputError(f'{self!r}: the array has NaN or infinity as float32: replace those values first')
+
     def _of_drjit(self, x: Any, batch: tuple[int, ...]) -> Any:
         ensure_variant('cuda' if dr.backend_v(x) == dr.JitBackend.CUDA else 'cpu')
         if not math.prod(batch):
             return dr.zeros(mi.TensorXf, (*batch, *self.range_shape))
         flat = mi.Float(x.array if dr.is_tensor_v(x) else x)
         dr.make_opaque(flat)
-        if not dr.all(dr.isfinite(dr.detach(flat)))[0]:
-            raise InputError(f'{self!r}: the array has NaN or infinity as float32: replace those values first')
+        finite = dr.isfinite(dr.detach(flat))
+        if not dr.all(finite)[0]:
+            self.require_finite(finite.numpy())
         n, parts = math.prod(self.domain_shape), []
         for i in range(math.prod(batch)):
             item = (
@@ -118,7 +132,14 @@ class LinearMap(ABC):
         tolerance : float
             Tolerance of ARPACK, above 0. 1e-4 gives about six digits in some 20 calls of the map and of its transpose. 1e-2 gives
             two or three digits in about 6 calls, which suffices for the length of a step.
+
+        Raises
+        ------
+        InputError
+            For a tolerance that is not a finite number above 0.
         """
+        if not (isinstance(tolerance, Real) and not isinstance(tolerance, bool) and 0 < tolerance < math.inf):
+            raise InputError(f'tolerance must be a finite number above 0, not {shown(tolerance)}')
         flat = self.aslinearoperator()
         squared = flat.H @ flat
         n, ones = squared.shape[0], np.ones(squared.shape[0], np.float32)

@@ -19,25 +19,21 @@ ALIGNED = 64  # bytes at which Dr.Jit's own arrays begin; the alignment of other
 
 def apply_torch(linear_map: LinearMap, x: torch.Tensor) -> torch.Tensor:
     """The map of a tensor [..., *domain_shape] of real numbers, which is computed as float32."""
-    if x.is_complex():
-        raise InputError(f'{linear_map!r} takes real numbers, not {x.dtype}')
     if x.device.type not in ('cpu', 'cuda'):
         raise InputError(f'{linear_map!r} takes tensors on the CPU or on a CUDA device, not on {x.device}')
-    if x.layout is not torch.strided:
-        raise InputError(f'{linear_map!r} takes dense tensors, not {x.layout}: call to_dense() first')
     if x.device.type == 'cpu':
         warn_of_spinning()
-    return _Apply.apply(x.as_subclass(torch.Tensor).to(torch.float32), linear_map)
+    return _Apply.apply(x.as_subclass(torch.Tensor).to(torch.float32), linear_map, True)
 
 
 class _Apply(torch.autograd.Function):
     @staticmethod
-    def forward(x: torch.Tensor, linear_map: LinearMap) -> torch.Tensor:
+    def forward(x: torch.Tensor, linear_map: LinearMap, checked: bool) -> torch.Tensor:
         x = x.detach().contiguous()
-        # NumPy is several times as quick to tell.
-        finite = np.isfinite(x.numpy()).all() if x.device.type == 'cpu' else torch.isfinite(x).all()
-        if not finite:
-            raise InputError(f'{linear_map!r}: the tensor has NaN or infinity as float32: replace those values first')
+        if checked and x.device.type == 'cpu':
+            linear_map.require_finite(np.isfinite(x.numpy()))  # NumPy is several times as quick to tell
+        elif checked and not (finite := torch.isfinite(x)).all():
+            linear_map.require_finite(finite.cpu().numpy())
         with drjit_lock():
             active = ensure_variant(None if x.device.type == 'cpu' else 'cuda')
             if x.device.type == 'cpu' and active.startswith('cuda'):
@@ -55,17 +51,18 @@ class _Apply(torch.autograd.Function):
     def setup_context(ctx: Any, inputs: tuple, output: torch.Tensor) -> None:
         ctx.map = inputs[1]
 
+    # Derivatives are not checked: a GradScaler skips a step whose gradients are infinite.
     @staticmethod
     def backward(ctx: Any, upstream: torch.Tensor) -> tuple:
-        return _Apply.apply(upstream, ctx.map.T), None
+        return _Apply.apply(upstream, ctx.map.T, False), None, None
 
     @staticmethod
-    def jvp(ctx: Any, tangent: torch.Tensor, _: Any) -> torch.Tensor:
-        return _Apply.apply(tangent, ctx.map)
+    def jvp(ctx: Any, tangent: torch.Tensor, *_: Any) -> torch.Tensor:
+        return _Apply.apply(tangent, ctx.map, False)
 
     @staticmethod
-    def vmap(info: Any, in_dims: tuple, x: torch.Tensor, linear_map: LinearMap) -> tuple:
-        return _Apply.apply(x.movedim(in_dims[0], 0), linear_map), 0
+    def vmap(info: Any, in_dims: tuple, x: torch.Tensor, linear_map: LinearMap, checked: bool) -> tuple:
+        return _Apply.apply(x.movedim(in_dims[0], 0), linear_map, checked), 0
 
 
 # PyTorch asks for it at every call, and would work it out each time.

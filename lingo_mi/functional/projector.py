@@ -25,6 +25,7 @@ from lingo_mi.projectors.grid_pair import GridPair
 from lingo_mi.projectors.ray_gradient import moving
 from lingo_mi.projectors.stack import Block
 from lingo_mi.projectors.upload import uploaded
+from lingo_mi.projectors.usable import require_unfrozen
 
 MODELS = 'joseph', 'exact'
 
@@ -50,7 +51,8 @@ class Projector(LinearMap):
     views : slice or sequence of int, optional
         Views of the geometry (default: all).
     valid : array of bool, optional
-        Pixels to use, [view, v, u] or [v, u]. Others are zero in the projections and add nothing to the transpose.
+        Pixels to use, [view, v, u] or [v, u]. Others are zero in the projections and add nothing to the transpose, even if they
+        are NaN.
 
     Attributes
     ----------
@@ -98,11 +100,16 @@ class Projector(LinearMap):
             if not np.arange(len(geometry))[checked_views(views, len(geometry))].size:
                 raise InputError('the projector has no views: choose at least one')
             geometry, mask = geometry.subset(views), None if mask is None else mask[views]
-        self.geometry, self.valid = geometry, mask
+        self.geometry = geometry
+        self.valid = None if mask is None else np.array(mask, order='C')  # the caller may change theirs
         self._kind = GridPair if model == 'exact' else projector_class(geometry)
         self.model = 'exact' if self._kind is GridPair else 'joseph'
         self.domain_shape, self.range_shape = geometry.grid.shape, (len(geometry), *geometry.nDetector)
         self._built: dict[str, tuple[Any, Block]] = {}  # by Mitsuba's variant
+        self._single: dict[int, Projector] = {}  # by view
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), '_single': {}}  # a copy makes its own
 
     @cached_property
     def T(self) -> Backprojector:
@@ -111,9 +118,14 @@ class Projector(LinearMap):
 
     def __getitem__(self, views: int | Index) -> Projector:
         """The projector of some of the views; one view keeps its axis."""
-        if isinstance(views, int | np.integer):
-            views = [int(views)]
-        return Projector(self.geometry, model=self.model, views=views, valid=self.valid)
+        if isinstance(views, bool):  # which Python takes for 0 or 1
+            raise InputError(f'a view is chosen by its number, not by {views}')
+        if not isinstance(views, int | np.integer):
+            return Projector(self.geometry, model=self.model, views=views, valid=self.valid)
+        view = int(views)
+        if view not in self._single:  # Kaczmarz' method takes them again in each sweep
+            self._single[view] = Projector(self.geometry, model=self.model, views=[view], valid=self.valid)
+        return self._single[view]
 
     def __len__(self) -> int:
         return len(self.geometry)
@@ -136,7 +148,7 @@ class Projector(LinearMap):
             Rays to use instead of `A.geometry.rays().vectors`, [view, 4, 3], mm, of the volume's library: for each view the
             source (in a parallel beam its direction), the corner of the panel, and the steps u and v from pixel to pixel. Rays of
             float64 are used in float64. The volume then has no batch axes, and both arrays are differentiable once, in reverse
-            mode, and with Dr.Jit also in forward mode.
+            mode (in PyTorch also by `torch.func.grad`, but not under `vmap`), and with Dr.Jit also in forward mode.
 
         Returns
         -------
@@ -171,6 +183,7 @@ class Projector(LinearMap):
 
     def _with_rays(self, volume: Any, vectors: Any) -> Any:
         """Projections of a tensor [x, y, z] along the rays of a tensor [view, 4, 3], Float [view * v * u]."""
+        require_unfrozen(repr(self))
         poses = on_host(vectors, self.geometry)
         geometry = PosedGeometry(poses=poses, nDetector=self.geometry.nDetector, grid=self.geometry.grid)
         there = Projector(geometry, model=self.model, valid=self.valid)
@@ -231,6 +244,7 @@ class Backprojector(LinearMap):
     def __init__(self, projector: Projector):
         self._projector = projector
         self.domain_shape, self.range_shape = projector.range_shape, projector.domain_shape
+        self.counted = True if projector.valid is None else projector.valid
 
     @property
     def T(self) -> Projector:
@@ -258,7 +272,7 @@ def _mask(valid: ArrayLike, shape: tuple[int, ...]) -> np.ndarray:
         raise InputError(
             f'valid must be true or false for each pixel, {_by(shape)} or {_by(shape[1:])}, not {mask.dtype}, {_by(mask.shape)}'
         )
-    return np.ascontiguousarray(np.broadcast_to(mask, shape))
+    return np.broadcast_to(mask, shape)
 
 
 def _by(shape: tuple[int, ...]) -> str:

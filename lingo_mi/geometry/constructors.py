@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from lingo_mi.common.errors import InputError, shown
+from lingo_mi.common.errors import InputError, require_type, shown
 from lingo_mi.geometry import limits
 from lingo_mi.geometry.base import Geometry
 from lingo_mi.geometry.circle import CircularGeometry, circle_of, require_mode
@@ -62,6 +62,7 @@ def per_view(
 
 def from_poses(rays: Rays, nDetector: Any, grid: Grid) -> Geometry:
     """The scan of `Geometry.from_poses`."""
+    require_type('rays', rays, Rays, 'of an array [view, 4, 3] give Rays.from_vectors(array, parallel)')
     if rays.curve is not None:
         return _curved(rays, nDetector, grid)
     posed = PosedGeometry(poses=rays, nDetector=nDetector, grid=grid)

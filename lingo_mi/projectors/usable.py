@@ -68,8 +68,9 @@ def require_usable(centre: Any, scale: Any, rotation: Any, density: Any, where: 
 def require_unfrozen(what: str) -> None:
     """Raises InputError within a function under `dr.freeze`.
 
-    A projection shares its work out by counts that it reads back from the device, and these change with the cloud: a recording
-    cannot be replayed, and Dr.Jit ends the process if one is tried.
+    A projection of a cloud shares its work out by counts that it reads back from the device, and these change with the cloud: a
+    recording cannot be replayed, and Dr.Jit ends the process if one is tried. An operator of voxels reads back whether its
+    argument is finite.
 
     Parameters
     ----------
@@ -78,8 +79,8 @@ def require_unfrozen(what: str) -> None:
     """
     if dr.flag(dr.JitFlag.FreezingScope):
         raise InputError(
-            f'{what} cannot be recorded by dr.freeze, since it reads back how much work each view is: call it outside the '
-            'frozen function'
+            f'{what} cannot be recorded by dr.freeze, since it reads numbers back from the device: call it outside the frozen '
+            'function'
         )
 
 

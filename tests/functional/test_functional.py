@@ -414,6 +414,21 @@ def test_what_is_no_array(values):
         project(values, *GOOD[1:], scan())
 
 
+@pytest.mark.parametrize('function', [project, voxelize])
+@pytest.mark.parametrize('kind', ['torch', 'jax'])
+def test_complex_numbers(function, kind):
+    arrays = arrays_of(kind, map(np.complex64, GOOD))
+    with pytest.raises(InputError, match=f'{function.__name__} takes real numbers, not .*complex64'):
+        function(*arrays, scan())
+
+
+def test_sparse_tensors():
+    framework('torch')
+    arrays = [x.to_sparse() for x in arrays_of('torch', map(np.float32, GOOD))]
+    with pytest.raises(InputError, match='project takes dense tensors, not torch.sparse_coo'):
+        project(*arrays, scan())
+
+
 def test_several_kinds_at_once():
     with pytest.raises(InputError, match='of one kind, not means of Dr.Jit, scales of NumPy'):
         project(mi.TensorXf(GOOD[0]), *GOOD[1:], scan())
@@ -465,6 +480,33 @@ def test_twice_through_one_graph_of_torch():
     assert np.abs(host(of_other) - host(first)).max() > 0.1 * np.abs(host(first)).max()
     with pytest.raises(RuntimeError, match='second time'):
         torch.autograd.grad(images.mean(), arrays[3])
+
+
+@pytest.mark.parametrize('function', [project, voxelize])
+def test_second_derivatives_in_torch(function):
+    """They are an error, not zero."""
+    torch = framework('torch')
+    arrays = arrays_of('torch', columns(gaussians()))
+    arrays[0].requires_grad_()
+    loss = function(*arrays, scan()).square().sum()
+    (gradient,) = torch.autograd.grad(loss, arrays[0], create_graph=True)
+    with pytest.raises(InputError, match=f'{function.__name__} has first derivatives only'):
+        torch.autograd.grad(gradient.sum() + arrays[0].sum(), arrays[0])
+
+
+@pytest.mark.parametrize('function', [project, voxelize])
+def test_gradients_by_torch_func(function):
+    torch = framework('torch')
+    arrays = arrays_of('torch', columns(gaussians()))
+
+    def loss(*arrays):
+        return function(*arrays, scan()).square().sum()
+
+    actual = torch.func.grad(loss, argnums=(0, 3))(*arrays)
+    for x in arrays:
+        x.requires_grad_()
+    for a, b in zip(actual, torch.autograd.grad(loss(*arrays), (arrays[0], arrays[3]))):
+        assert_same(host(a), host(b))
 
 
 def test_back_through_graphs_in_another_thread():

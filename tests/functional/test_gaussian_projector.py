@@ -68,6 +68,21 @@ def test_kinds_of_arrays(kind):
     np.testing.assert_allclose(array.grad / 2, expected, **close)
 
 
+@pytest.mark.parametrize('value', [np.nan, np.inf])
+@pytest.mark.parametrize('kind', ['torch', 'jax'])
+def test_gradients_that_are_not_finite(kind, value):
+    module = pytest.importorskip(kind, reason=f'{kind} is not installed')
+    A = GaussianProjector(*SHAPES, SCANS['cone'])
+    x, _ = pair(A)
+    if kind == 'torch':
+        x = module.tensor(x, requires_grad=True)
+        (A(x) * value).sum().backward()
+        gradient = x.grad
+    else:
+        gradient = module.grad(lambda x: (A(x) * value).sum())(module.numpy.asarray(x))
+    assert not np.isfinite(np.asarray(gradient)).any()
+
+
 @pytest.mark.parametrize(
     'make, message',
     [

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import gc
 import os
+import pickle
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -289,6 +292,18 @@ def test_views_one_by_one():
     A = Projector(GEOMETRIES['cone'])
     x, _ = pair(A.domain_shape, A.range_shape)
     np.testing.assert_array_equal(np.concatenate([one(x) for one in A]), A(x))
+    assert A[1] is A[np.int64(1)] and A[1] is list(A)[1], 'made once'
+    for other in (copy.copy(A), copy.deepcopy(A), pickle.loads(pickle.dumps(A))):
+        assert other[1] is not A[1]
+        np.testing.assert_array_equal(other[1](x), A[1](x))
+
+
+@pytest.mark.parametrize('views', [None, slice(0, 2)])
+def test_a_mask_is_a_copy(views):
+    valid = np.ones((3, *GEOMETRIES['cone'].nDetector), bool)
+    A = Projector(GEOMETRIES['cone'], valid=valid, views=views)
+    valid[:] = False
+    assert A(np.ones(A.domain_shape)).any()
 
 
 def test_threads():
@@ -309,6 +324,40 @@ def test_values_that_are_not_finite(kind, value):
     assert '\n' not in str(caught.value)
 
 
+@pytest.mark.parametrize('kind', ['torch', 'jax'])
+@pytest.mark.parametrize('value', [np.nan, np.inf])
+def test_gradients_that_are_not_finite(kind, value):
+    """They are passed on in both modes: PyTorch's GradScaler skips a step whose gradients are infinite."""
+    module, A = framework(kind), Projector(GEOMETRIES['cone'])
+    values = pair(A.domain_shape, A.range_shape)
+    for linear_map, x in zip((A, A.T), (array_of(kind, v) for v in values)):
+        if kind == 'torch':
+            with_grad = x.clone().requires_grad_()
+            (linear_map(with_grad) * value).sum().backward()
+            gradient, along = with_grad.grad, module.func.jvp(linear_map, (x,), (x * value,))[1]
+        else:
+            gradient = module.grad(lambda x, linear_map=linear_map: (linear_map(x) * value).sum())(x)
+            along = module.jvp(linear_map, (x,), (x * value,))[1]
+        assert not np.isfinite(host(gradient)).all() and not np.isfinite(host(along)).all()
+
+
+@pytest.mark.parametrize('kind', KINDS)
+@pytest.mark.parametrize('model', ['joseph', 'exact'])
+def test_pixels_that_are_not_valid_may_be_nan(kind, model):
+    """So may they in a scan. Those of valid pixels are refused."""
+    g = GEOMETRIES['cone']
+    valid = np.random.default_rng(1).random((3, *g.nDetector)) < 0.7
+    A = Projector(g, model=model, valid=valid)
+    y = np.where(valid, pair((2, *A.domain_shape), (2, *A.range_shape))[1], 0)
+    expected = A.T(y)
+    y[:, ~valid] = np.nan
+    y[0][~valid] = np.inf
+    np.testing.assert_allclose(host(A.T(array_of(kind, y))), expected, atol=1e-5 * np.abs(expected).max())
+    y[1][tuple(np.argwhere(valid)[0])] = np.nan
+    with pytest.raises(InputError, match='NaN or infinity'):
+        A.T(array_of(kind, y))
+
+
 @pytest.mark.parametrize('kind', KINDS)
 @pytest.mark.parametrize('shape', [(), (9,), (9, 11), (11, 9, 7), (3, 17, 21)])
 def test_other_shapes(kind, shape):
@@ -327,8 +376,18 @@ def test_other_shapes(kind, shape):
         (lambda g: Projector(g)[np.zeros(3, bool)], 'no views'),
         (lambda g: Projector(g, views=[3]), 'from 0 to 2'),
         (lambda g: Projector(g)[5], 'from 0 to 2'),
+        (lambda g: Projector(g)[True], 'by its number, not by True'),
         (lambda g: Projector(g, valid=np.ones((3, 4, 4), bool)), 'valid must be true or false'),
         (lambda g: Projector(g, valid=np.ones((17, 21))), 'valid must be true or false'),
+        (lambda g: Projector(g)(np.ma.masked_equal(np.eye(3), 1)), 'some values are masked'),
+        (lambda g: Projector(g, valid=np.ma.masked_equal(np.eye(17, 21) > 0, True)), 'some values are masked'),
+        *(
+            (
+                lambda g, value=value: Projector(g).norm(value),
+                f'tolerance must be a finite number above 0, not {value!r}',
+            )
+            for value in (float('nan'), float('inf'), 0, -1, 'a', True)
+        ),
         (lambda g: Projector(g)('text'), 'cannot be read as an array'),
         (lambda g: Projector(g)(None), 'cannot be read as an array'),
         (lambda g: Projector(g)(np.zeros((9, 11, 7), complex)), 'not real numbers'),
@@ -370,12 +429,22 @@ def test_the_operator_of_matrices():
         Projector(GEOMETRIES['cone']) @ np.zeros((9, 11, 7))
 
 
-def test_tensors_that_are_not_dense():
-    torch = framework('torch')
+def arguments_of(kind):
+    """Keyword arguments for a call of A: none, and rays."""
+    return {}, dict(rays=array_of(kind, GEOMETRIES['cone'].rays().vectors))
+
+
+@pytest.mark.filterwarnings('ignore:The PyTorch API of nested tensors')
+@pytest.mark.parametrize('with_rays', [0, 1])
+def test_tensors_that_are_not_dense(with_rays):
+    torch, A, given = framework('torch'), Projector(GEOMETRIES['cone']), arguments_of('torch')[with_rays]
     with pytest.raises(InputError, match=r'takes dense tensors, not torch.sparse_coo: call to_dense\(\) first'):
-        Projector(GEOMETRIES['cone'])(torch.zeros(9, 11, 7).to_sparse())
-    with pytest.raises(InputError, match='not on meta'):
-        Projector(GEOMETRIES['cone'])(torch.zeros(9, 11, 7, device='meta'))
+        A(torch.zeros(9, 11, 7).to_sparse(), **given)
+    for layout in (torch.strided, torch.jagged):
+        with pytest.raises(InputError, match='takes dense tensors, not nested ones'):
+            A(torch.nested.nested_tensor([torch.zeros(11, 7)] * 9, layout=layout), **given)
+    with pytest.raises(InputError, match='not on .*meta'):
+        A(torch.zeros(9, 11, 7, device='meta'), **given)
 
 
 def test_a_geometry_keeps_no_derivatives():
@@ -384,12 +453,33 @@ def test_a_geometry_keeps_no_derivatives():
         scan(n=3, angles=torch.zeros(3, requires_grad=True))
 
 
+@pytest.mark.parametrize('with_rays', [0, 1])
 @pytest.mark.parametrize('kind', ['torch', 'jax'])
-def test_complex_arrays(kind):
-    module = framework(kind)
-    zeros = np.zeros((9, 11, 7), np.complex64)
-    with pytest.raises(InputError, match='real numbers'):
-        Projector(GEOMETRIES['cone'])(module.tensor(zeros) if kind == 'torch' else module.numpy.asarray(zeros))
+def test_complex_arrays(kind, with_rays):
+    zeros = array_of(kind, np.zeros((9, 11, 7), np.complex64))
+    with pytest.raises(InputError, match='takes real numbers, not .*complex64'):
+        Projector(GEOMETRIES['cone'])(zeros, **arguments_of(kind)[with_rays])
+
+
+@pytest.mark.parametrize('with_rays', [0, 1])
+def test_sparse_arrays_of_jax(with_rays):
+    framework('jax')
+    from jax.experimental import sparse
+
+    zeros = sparse.BCOO.fromdense(np.zeros((9, 11, 7), np.float32))
+    with pytest.raises(InputError, match='takes dense arrays, not BCOO'):
+        Projector(GEOMETRIES['cone'])(zeros, **arguments_of('jax')[with_rays])
+
+
+@pytest.mark.parametrize('with_rays', [0, 1])
+def test_within_a_frozen_function(with_rays):
+    A, x = Projector(GEOMETRIES['cone']), mi.TensorXf(np.ones((9, 11, 7), np.float32))
+    given = dict(rays=mi.TensorXd(A.geometry.rays().vectors)) if with_rays else {}
+    gc.collect()  # Dr.Jit's recording does not bear objects of other tests that go meanwhile
+    with pytest.raises(RuntimeError) as caught:  # Dr.Jit puts its own exception around ours
+        dr.freeze(lambda x, **given: A(x, **given))(x, **given)
+    assert isinstance(caught.value.__cause__, InputError) and 'dr.freeze' in str(caught.value.__cause__)
+    assert A(x).numpy().any()
 
 
 def test_kernels_serve_any_number_of_views_and_calls():

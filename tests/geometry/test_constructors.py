@@ -120,6 +120,12 @@ def test_poses_choose_their_kind():
     np.testing.assert_allclose(posed.angles, ANGLES)
 
 
+@pytest.mark.parametrize('rays', [scanner().vectors, scanner().vectors.tolist()], ids=['array', 'list'])
+def test_poses_are_rays(rays):
+    with pytest.raises(InputError, match=r'rays must be a Rays, not (ndarray|list); .*Rays.from_vectors'):
+        Geometry.from_poses(rays, PANEL['nDetector'], **GRID)
+
+
 @pytest.mark.parametrize(
     'make, change, match',
     [
