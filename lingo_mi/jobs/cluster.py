@@ -12,6 +12,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from os import PathLike
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -161,13 +162,13 @@ class Cluster:
             raise InputError(
                 f'no worker of the cluster came within {PATIENCE:.0f} s; start some, by `dask worker --nthreads 1`'
             ) from None
-        try:
-            workers = self.client.run(describe_worker, self.folder)
-        except OSError as error:
-            raise InputError(
-                f'a worker of the cluster does not answer ({brief(error, 160)}); end it, and run the same command again'
-            ) from None
-        for worker in workers.values():
+        for address, worker in self.client.run(describe_worker, self.folder, on_error='return').items():
+            if isinstance(worker, OSError):
+                raise InputError(
+                    f'worker {address}: does not answer ({brief(worker, 120)}); end it, and run the same command again'
+                )
+            if isinstance(worker, Exception):
+                raise InputError(f'worker {address}: {brief(worker, 120)}; install lingo_mi {version("lingo_mi")} there')
             require_fit(worker, self.folder, self.variant)
 
 

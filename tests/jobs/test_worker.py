@@ -1,6 +1,7 @@
 """Workers that cannot do a job: one line that names them."""
 
 import errno
+import importlib
 import os
 from pathlib import Path
 
@@ -84,9 +85,19 @@ def test_a_worker_without_the_backend(client, tmp_path, monkeypatch):
 def test_a_worker_that_hangs(client, monkeypatch):
     from distributed.comm.core import CommClosedError
 
-    def run(*_, **__):
-        raise CommClosedError('remote=tcp://10.0.0.7:1: Stream is closed')
+    monkeypatch.setattr(client, 'run', lambda *_, **__: {'tcp://10.0.0.7:1': CommClosedError('Stream is closed')})
+    with pytest.raises(InputError, match=r'^worker tcp://10.0.0.7:1: does not answer \(.*; end it, and run the same'):
+        Cluster(client, None, 0, None)
 
-    monkeypatch.setattr(client, 'run', run)
-    with pytest.raises(InputError, match=r'^a worker .* does not answer \(.*10.0.0.7:1.*; end it, and run the same'):
+
+class Lacking:
+    """A function that a worker cannot read."""
+
+    def __reduce__(self):
+        return importlib.import_module, ('no_such_module',)
+
+
+def test_a_worker_that_lacks_the_package(client, monkeypatch):
+    monkeypatch.setattr('lingo_mi.jobs.cluster.describe_worker', Lacking())
+    with pytest.raises(InputError, match='^worker inproc://.*No module named .*no_such_module.*; install lingo_mi .* there'):
         Cluster(client, None, 0, None)
