@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 import queue
 import re
@@ -11,8 +12,8 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from os import PathLike
 from importlib.metadata import version
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from lingo_mi.jobs.worker import describe_worker, require_fit, runs_job, work
 from lingo_mi.storage.file_access import optional
 
 PATIENCE = 60.0  # seconds: for the first worker, and for jobs that are told to stop
+ANSWER = 10.0  # seconds: for a scheduler
 MOST_LOCAL = 1024
 TIMED_OUT = TimeoutError, asyncio.TimeoutError  # one class from Python 3.11 on
 
@@ -75,18 +77,40 @@ def opened(
         if local:
             count = int(local[1])
             threads = threads or max(1, cores() // count)
-            where: dict[str, Any] = dict(address=stack.enter_context(_local(distributed, count)))
-        elif address.endswith('.json'):
-            if not Path(address).is_file():
-                raise InputError(f'cluster={address}: there is no such file of a scheduler; check the path')
-            where = dict(scheduler_file=address)
+            where = stack.enter_context(_local(distributed, count))
         else:
-            where = dict(address=address)
-        try:
-            client = stack.enter_context(distributed.Client(**where, timeout='10s', set_as_default=False))
-        except (OSError, ValueError, *TIMED_OUT) as error:  # ValueError: no address
-            raise InputError(f'cluster={address}: no scheduler answers ({brief(error, 120)}); check it') from None
+            where = _answering(distributed, address)
+        client = stack.enter_context(distributed.Client(where, timeout=ANSWER, set_as_default=False))
         yield Cluster(client, folder, threads, variant, bar)
+
+
+def _answering(distributed: Any, address: str) -> str:
+    """The address of the scheduler that answers at an address, or by its file.
+
+    Raises
+    ------
+    InputError
+        If none does. It is asked before there is a client, which would go on trying.
+    """
+
+    async def ask():
+        async with distributed.rpc(where, connection_args=distributed.Security().get_connection_args('client')) as server:
+            if 'workers' not in await server.identity():
+                raise ValueError('it is a worker')
+
+    where = address
+    try:
+        if address.endswith('.json'):
+            where = json.loads(Path(address).read_text())['address']
+        distributed.utils.LoopRunner().run_sync(ask, callback_timeout=ANSWER)
+    except FileNotFoundError:
+        raise InputError(f'cluster={address}: there is no such file of a scheduler; check the path') from None
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, *TIMED_OUT) as error:
+        wrong = f'cluster={address}: no scheduler answers ({brief(error, 120)})' if address else 'cluster is empty'
+        if address.startswith(('http://', 'https://')):
+            wrong = f"cluster={address}: is the dashboard's address"
+        raise InputError(f"{wrong}; give the scheduler's address, such as tcp://HOST:8786, or its file") from None
+    return where
 
 
 @contextmanager
