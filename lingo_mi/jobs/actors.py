@@ -75,8 +75,7 @@ class Actors:
         from distributed.protocol.pickle import dumps
 
         client = self._cluster.client
-        if not client.nthreads():
-            self._cluster.require_workers()
+        self._cluster.require_a_worker()
         there = client.nthreads()
         self._actors = {a: pair for a, pair in self._actors.items() if a in there and pair[0].status == 'finished'}
         chosen = sorted(there, key=lambda a: a not in self._actors)[:count]

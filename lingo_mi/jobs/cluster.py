@@ -10,7 +10,7 @@ import re
 import secrets
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib.metadata import version
 from os import PathLike
@@ -25,7 +25,7 @@ from lingo_mi.jobs.job import Event, Job, Tell
 from lingo_mi.jobs.worker import describe_worker, require_fit, runs_job, work
 from lingo_mi.storage.file_access import optional
 
-PATIENCE = 60.0  # seconds: for the first worker, and for jobs that are told to stop
+PATIENCE = 60.0  # seconds: for a worker if there is none, and for jobs that are told to stop
 ANSWER = 10.0  # seconds: for a scheduler
 MOST_LOCAL = 1024
 TIMED_OUT = TimeoutError, asyncio.TimeoutError  # one class from Python 3.11 on
@@ -149,7 +149,7 @@ class Cluster:
                 futures[job.name] = future
                 future.add_done_callback(lambda future, name=job.name: events.put((name, 'ended', future)))
             with Progress('Jobs', sum(job.steps for job in jobs), shown=self._bar) as bar:
-                _follow(by_name, events, tell, bar)
+                _follow(by_name, events, tell, bar, self.require_a_worker)
             if self.client.status != 'running':
                 raise InputError('the scheduler has gone; start one, and run the same command again')
             self.client.unsubscribe_topic(topic)
@@ -171,6 +171,11 @@ class Cluster:
         ends = time.monotonic() + PATIENCE
         while any(self.client.run(runs_job, topic, on_error='ignore').values()) and time.monotonic() < ends:
             time.sleep(0.2)
+
+    def require_a_worker(self) -> None:
+        """As `require_workers`, if all workers have gone and the scheduler has not."""
+        if self.client.status == 'running' and not self.client.nthreads():
+            self.require_workers()
 
     def require_workers(self) -> None:
         """Wait for the first worker, and check all that are there.
@@ -204,13 +209,16 @@ def _gone() -> tuple[type[BaseException], ...]:
     return CommClosedError, FutureCancelledError, *TIMED_OUT
 
 
-def _follow(jobs: dict[str, Job], events: queue.SimpleQueue, tell: Tell, bar: Progress) -> None:
-    """Pass events on until every job has ended."""
+def _follow(
+    jobs: dict[str, Job], events: queue.SimpleQueue, tell: Tell, bar: Progress, wait: Callable[[], object]
+) -> None:
+    """Pass events on until every job has ended, calling `wait` when there are none."""
     steps, running, left = dict.fromkeys(jobs, 0), set(), set(jobs)
     while left:
         try:
             name, kind, value = events.get(timeout=0.5)
         except queue.Empty:
+            wait()
             continue
         if name not in left:  # sent before the end of the job, and received after it
             continue

@@ -3,6 +3,7 @@
 import errno
 import importlib
 import os
+import time
 from pathlib import Path
 
 import mitsuba as mi
@@ -101,3 +102,21 @@ def test_a_worker_that_lacks_the_package(client, monkeypatch):
     monkeypatch.setattr('lingo_mi.jobs.cluster.describe_worker', Lacking())
     with pytest.raises(InputError, match='^worker inproc://.*No module named .*no_such_module.*; install lingo_mi .* there'):
         Cluster(client, None, 0, None)
+
+
+def waits(*, report):
+    time.sleep(0.5)
+
+
+def test_the_last_worker_goes(monkeypatch):
+    options = dict(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=':0', memory_limit=0)
+    with distributed.LocalCluster(**options) as local, distributed.Client(local, set_as_default=False) as client:
+        cluster = Cluster(client, None, 0, mi.variant(), bar=False)
+        monkeypatch.setattr('lingo_mi.jobs.cluster.PATIENCE', 0.5)
+
+        def leave(event):
+            if event.kind == 'began':
+                client.retire_workers(client.nthreads())
+
+        with pytest.raises(InputError, match=r'^no worker of the cluster came within .*; start some'):
+            cluster.run([Job(str(i), 1, waits) for i in range(3)], leave)
