@@ -94,7 +94,9 @@ def _answering(distributed: Any, address: str) -> str:
     """
 
     async def ask():
-        async with distributed.rpc(where, connection_args=distributed.Security().get_connection_args('client')) as server:
+        async with distributed.rpc(
+            where, connection_args=distributed.Security().get_connection_args('client')
+        ) as server:
             if 'workers' not in await server.identity():
                 raise ValueError('it is a worker')
 
@@ -197,7 +199,9 @@ class Cluster:
                     f'worker {address}: does not answer ({brief(worker, 120)}); end it, and run the same command again'
                 )
             if isinstance(worker, Exception):
-                raise InputError(f'worker {address}: {brief(worker, 120)}; install lingo_mi {version("lingo_mi")} there')
+                raise InputError(
+                    f'worker {address}: {brief(worker, 120)}; install lingo_mi {version("lingo_mi")} there'
+                )
             require_fit(worker, self.folder, self.variant)
 
 

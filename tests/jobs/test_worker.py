@@ -100,7 +100,9 @@ class Lacking:
 
 def test_a_worker_that_lacks_the_package(client, monkeypatch):
     monkeypatch.setattr('lingo_mi.jobs.cluster.describe_worker', Lacking())
-    with pytest.raises(InputError, match='^worker inproc://.*No module named .*no_such_module.*; install lingo_mi .* there'):
+    with pytest.raises(
+        InputError, match='^worker inproc://.*No module named .*no_such_module.*; install lingo_mi .* there'
+    ):
         Cluster(client, None, 0, None)
 
 
