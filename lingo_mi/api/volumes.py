@@ -196,13 +196,14 @@ def _check(algorithm: Any, start: Fit | np.ndarray | None, views: int | None, pa
     if slab is None:
         return
     if path is None:
-        raise InputError('slab=N writes the volume while it is made: give out=FILE')
+        raise InputError('a volume in slabs is written while it is made: give out=FILE')
     if not isinstance(algorithm, InSlabs):
         raise InputError(
-            f'slab=N is for fdk, sart, os-sart, sirt and asd-pocs; {algorithm.name} needs the whole volume: leave it out'
+            f'slabs are for fdk, sart, os-sart, sirt and asd-pocs; {algorithm.name} needs the whole volume: '
+            'leave out slab and cluster'
         )
     if start is not None and views is None:
-        raise InputError('slab=N starts from an empty volume: leave out start, or slab')
+        raise InputError('a volume in slabs starts empty: leave out start, or slab and cluster')
 
 
 def _check_output(path: Path, algorithm: Algorithm, force: bool, unit: Unit) -> None:

@@ -145,16 +145,19 @@ def check_arguments(args: argparse.Namespace) -> None:
     if args.seed is not None:
         check_seed(args.seed)
     name, fit = args.algorithm, args.complete or args.start
+    given = ' and '.join(f'--{option}' for option in ('slab', 'cluster') if getattr(args, option) is not None)
     if args.cluster is not None and args.slab is None:
         args.slab = THICKNESS
     if args.slab is not None and args.report is not None:
-        raise InputError('--report needs the whole volume: leave out --slab and --cluster')
-    if args.slab is not None and (args.slab < 1 or name not in IN_SLABS):
+        raise InputError(f'--report needs the whole volume: leave out {given}')
+    if args.slab is not None and args.slab < 1:
+        raise InputError(f'--slab is a number of slices from 1 on, not {args.slab}')
+    if args.slab is not None and name not in IN_SLABS:
         raise InputError(
-            f'--slab is a number of slices from 1 on, and goes, as --cluster, with --algorithm {", ".join(IN_SLABS)}'
+            f'--algorithm {name} needs the whole volume: leave out {given}, or choose {", ".join(IN_SLABS)}'
         )
     if args.slab is not None and args.start:
-        raise InputError('--slab starts from an empty volume: leave out --start, or --slab')
+        raise InputError(f'a volume in slabs starts empty: leave out --start, or {given}')
     if name == 'best' and fit:
         raise InputError(
             '--algorithm best chooses by measured views, which a fit has seen already: leave out --complete and --start'

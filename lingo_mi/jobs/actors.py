@@ -75,8 +75,7 @@ class Actors:
         from distributed.protocol.pickle import dumps
 
         client = self._cluster.client
-        if not client.nthreads():
-            self._cluster.require_workers()
+        self._cluster.require_a_worker()
         there = client.nthreads()
         self._actors = {a: pair for a, pair in self._actors.items() if a in there and pair[0].status == 'finished'}
         chosen = sorted(there, key=lambda a: a not in self._actors)[:count]
@@ -111,10 +110,16 @@ class _Actor:
         self._pickled, self._threads, self._variant, self._resident = pickled, threads, variant, None
 
     def call(self, method: str, part: Sequence[Any], *arguments: Any) -> Any:
-        if self._resident is None:  # made here, since Dask calls an actor in another thread than it makes it
-            self._resident = _prepared(self._pickled, self._threads, self._variant)
-            self._pickled = b''
-        return getattr(self._resident, method)(part, *arguments)
+        from distributed import get_worker
+
+        try:
+            if self._resident is None:  # made here, since Dask calls an actor in another thread than it makes it
+                self._resident = _prepared(self._pickled, self._threads, self._variant)
+                self._pickled = b''
+            return getattr(self._resident, method)(part, *arguments)
+        except (OSError, RuntimeError, MemoryError) as error:  # the client would take the first two for a lost worker
+            reason = brief(f'{type(error).__name__}: {error}', 160)
+            raise InputError(f'worker {get_worker().address}: {reason}') from error
 
 
 def _prepared(pickled: bytes, threads: int, variant: str | None) -> Any:

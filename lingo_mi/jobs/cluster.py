@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import logging
 import queue
 import re
 import secrets
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from importlib.metadata import version
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,8 @@ from lingo_mi.jobs.job import Event, Job, Tell
 from lingo_mi.jobs.worker import describe_worker, require_fit, runs_job, work
 from lingo_mi.storage.file_access import optional
 
-PATIENCE = 60.0  # seconds: for the first worker, and for jobs that are told to stop
+PATIENCE = 60.0  # seconds: for a worker if there is none, and for jobs that are told to stop
+ANSWER = 10.0  # seconds: for a scheduler
 MOST_LOCAL = 1024
 TIMED_OUT = TimeoutError, asyncio.TimeoutError  # one class from Python 3.11 on
 
@@ -74,18 +77,42 @@ def opened(
         if local:
             count = int(local[1])
             threads = threads or max(1, cores() // count)
-            where: dict[str, Any] = dict(address=stack.enter_context(_local(distributed, count)))
-        elif address.endswith('.json'):
-            if not Path(address).is_file():
-                raise InputError(f'cluster={address}: there is no such file of a scheduler; check the path')
-            where = dict(scheduler_file=address)
+            where = stack.enter_context(_local(distributed, count))
         else:
-            where = dict(address=address)
-        try:
-            client = stack.enter_context(distributed.Client(**where, timeout='10s', set_as_default=False))
-        except (OSError, ValueError, *TIMED_OUT) as error:  # ValueError: no address
-            raise InputError(f'cluster={address}: no scheduler answers ({brief(error, 120)}); check it') from None
+            where = _answering(distributed, address)
+        client = stack.enter_context(distributed.Client(where, timeout=ANSWER, set_as_default=False))
         yield Cluster(client, folder, threads, variant, bar)
+
+
+def _answering(distributed: Any, address: str) -> str:
+    """The address of the scheduler that answers at an address, or by its file.
+
+    Raises
+    ------
+    InputError
+        If none does. It is asked before there is a client, which would go on trying.
+    """
+
+    async def ask():
+        async with distributed.rpc(
+            where, connection_args=distributed.Security().get_connection_args('client')
+        ) as server:
+            if 'workers' not in await server.identity():
+                raise ValueError('it is a worker')
+
+    where = address
+    try:
+        if address.endswith('.json'):
+            where = json.loads(Path(address).read_text())['address']
+        distributed.utils.LoopRunner().run_sync(ask, callback_timeout=ANSWER)
+    except FileNotFoundError:
+        raise InputError(f'cluster={address}: there is no such file of a scheduler; check the path') from None
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, *TIMED_OUT) as error:
+        wrong = f'cluster={address}: no scheduler answers ({brief(error, 120)})' if address else 'cluster is empty'
+        if address.startswith(('http://', 'https://')):
+            wrong = f"cluster={address}: is the dashboard's address"
+        raise InputError(f"{wrong}; give the scheduler's address, such as tcp://HOST:8786, or its file") from None
+    return where
 
 
 @contextmanager
@@ -124,7 +151,7 @@ class Cluster:
                 futures[job.name] = future
                 future.add_done_callback(lambda future, name=job.name: events.put((name, 'ended', future)))
             with Progress('Jobs', sum(job.steps for job in jobs), shown=self._bar) as bar:
-                _follow(by_name, events, tell, bar)
+                _follow(by_name, events, tell, bar, self.require_a_worker)
             if self.client.status != 'running':
                 raise InputError('the scheduler has gone; start one, and run the same command again')
             self.client.unsubscribe_topic(topic)
@@ -147,6 +174,11 @@ class Cluster:
         while any(self.client.run(runs_job, topic, on_error='ignore').values()) and time.monotonic() < ends:
             time.sleep(0.2)
 
+    def require_a_worker(self) -> None:
+        """As `require_workers`, if all workers have gone and the scheduler has not."""
+        if self.client.status == 'running' and not self.client.nthreads():
+            self.require_workers()
+
     def require_workers(self) -> None:
         """Wait for the first worker, and check all that are there.
 
@@ -161,13 +193,15 @@ class Cluster:
             raise InputError(
                 f'no worker of the cluster came within {PATIENCE:.0f} s; start some, by `dask worker --nthreads 1`'
             ) from None
-        try:
-            workers = self.client.run(describe_worker, self.folder)
-        except OSError as error:
-            raise InputError(
-                f'a worker of the cluster does not answer ({brief(error, 160)}); end it, and run the same command again'
-            ) from None
-        for worker in workers.values():
+        for address, worker in self.client.run(describe_worker, self.folder, on_error='return').items():
+            if isinstance(worker, OSError):
+                raise InputError(
+                    f'worker {address}: does not answer ({brief(worker, 120)}); end it, and run the same command again'
+                )
+            if isinstance(worker, Exception):
+                raise InputError(
+                    f'worker {address}: {brief(worker, 120)}; install lingo_mi {version("lingo_mi")} there'
+                )
             require_fit(worker, self.folder, self.variant)
 
 
@@ -179,13 +213,16 @@ def _gone() -> tuple[type[BaseException], ...]:
     return CommClosedError, FutureCancelledError, *TIMED_OUT
 
 
-def _follow(jobs: dict[str, Job], events: queue.SimpleQueue, tell: Tell, bar: Progress) -> None:
-    """Pass events on until every job has ended."""
+def _follow(
+    jobs: dict[str, Job], events: queue.SimpleQueue, tell: Tell, bar: Progress, wait: Callable[[], object]
+) -> None:
+    """Pass events on until every job has ended, calling `wait` when there are none."""
     steps, running, left = dict.fromkeys(jobs, 0), set(), set(jobs)
     while left:
         try:
             name, kind, value = events.get(timeout=0.5)
         except queue.Empty:
+            wait()
             continue
         if name not in left:  # sent before the end of the job, and received after it
             continue

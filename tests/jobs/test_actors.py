@@ -5,6 +5,7 @@ import pytest
 
 from helpers.dask_cluster import wait_until
 from lingo_mi.common.errors import InputError
+from lingo_mi.jobs import actors as actors_module
 from lingo_mi.jobs.actors import Actors
 from lingo_mi.jobs.cluster import Cluster
 
@@ -20,18 +21,16 @@ def local():
 
 
 class Squares:
-    """An object on each worker; with `gone`, every call fails like a call of a lost worker."""
-
-    def __init__(self, gone=False):
-        self.gone = gone
+    """An object on each worker."""
 
     def squares(self, items, offset):
-        if self.gone:
-            raise OSError('Unable to contact')
         return [(i, i * i + offset) for i in items], id(self), distributed.get_worker().address
 
     def refuses(self, items):
         raise InputError(f'cannot do {items}')
+
+    def exhausts(self, items):
+        raise RuntimeError('jit_malloc(): out of memory')
 
 
 def leave(dask_worker):
@@ -76,6 +75,17 @@ def test_a_part_is_done_again(local):
     assert done(actors.divided('squares', range(5), 0)) == [(i, i * i) for i in range(5)] and lost == [[0, 2, 4]]
 
 
-def test_workers_that_are_always_lost(local):
+def test_workers_that_are_always_lost(local, monkeypatch):
+    monkeypatch.setattr(actors_module, '_called', lambda *_: lost)
     with pytest.raises(InputError, match=r'have gone \(Unable to contact\); start them, and go on with resume=True'):
-        Actors(local, Squares(gone=True)).divided('squares', range(5), 7)
+        Actors(local, Squares()).divided('squares', range(5), 7)
+
+
+def lost():
+    raise OSError('Unable to contact')
+
+
+def test_an_error_of_a_worker(local):
+    """It names the worker, which has not gone."""
+    with pytest.raises(InputError, match=r'^worker inproc://.*: RuntimeError: jit_malloc\(\): out of memory$'):
+        Actors(local, Squares()).divided('exhausts', range(5))

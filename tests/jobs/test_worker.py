@@ -1,7 +1,9 @@
 """Workers that cannot do a job: one line that names them."""
 
 import errno
+import importlib
 import os
+import time
 from pathlib import Path
 
 import mitsuba as mi
@@ -84,9 +86,39 @@ def test_a_worker_without_the_backend(client, tmp_path, monkeypatch):
 def test_a_worker_that_hangs(client, monkeypatch):
     from distributed.comm.core import CommClosedError
 
-    def run(*_, **__):
-        raise CommClosedError('remote=tcp://10.0.0.7:1: Stream is closed')
-
-    monkeypatch.setattr(client, 'run', run)
-    with pytest.raises(InputError, match=r'^a worker .* does not answer \(.*10.0.0.7:1.*; end it, and run the same'):
+    monkeypatch.setattr(client, 'run', lambda *_, **__: {'tcp://10.0.0.7:1': CommClosedError('Stream is closed')})
+    with pytest.raises(InputError, match=r'^worker tcp://10.0.0.7:1: does not answer \(.*; end it, and run the same'):
         Cluster(client, None, 0, None)
+
+
+class Lacking:
+    """A function that a worker cannot read."""
+
+    def __reduce__(self):
+        return importlib.import_module, ('no_such_module',)
+
+
+def test_a_worker_that_lacks_the_package(client, monkeypatch):
+    monkeypatch.setattr('lingo_mi.jobs.cluster.describe_worker', Lacking())
+    with pytest.raises(
+        InputError, match='^worker inproc://.*No module named .*no_such_module.*; install lingo_mi .* there'
+    ):
+        Cluster(client, None, 0, None)
+
+
+def waits(*, report):
+    time.sleep(0.5)
+
+
+def test_the_last_worker_goes(monkeypatch):
+    options = dict(processes=False, n_workers=1, threads_per_worker=1, dashboard_address=':0', memory_limit=0)
+    with distributed.LocalCluster(**options) as local, distributed.Client(local, set_as_default=False) as client:
+        cluster = Cluster(client, None, 0, mi.variant(), bar=False)
+        monkeypatch.setattr('lingo_mi.jobs.cluster.PATIENCE', 0.5)
+
+        def leave(event):
+            if event.kind == 'began':
+                client.retire_workers(client.nthreads())
+
+        with pytest.raises(InputError, match=r'^no worker of the cluster came within .*; start some'):
+            cluster.run([Job(str(i), 1, waits) for i in range(3)], leave)

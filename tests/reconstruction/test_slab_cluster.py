@@ -14,6 +14,7 @@ import pytest
 
 import lingo_mi as lm
 from helpers.dask_cluster import cluster, wait_until
+from lingo_mi.cli import reconstruct
 from lingo_mi.common.errors import InputError
 from lingo_mi.files.scans import read_scan, write_scan
 from lingo_mi.files.slabs import SharedZarr
@@ -325,8 +326,19 @@ def test_bad_input(scan, tmp_path):
     refused('give out=FILE', cluster='local:2')
     refused('workers of a cluster write parts of one .ome.zarr', cluster='local:2', out=tmp_path / 'a.nii.gz')
     refused('multiple of 64 slices on a cluster, not 50: give slab=64', cluster='local:2', out=out, slab=50)
-    refused('needs the whole volume', lm.CGLS(niter=1), cluster='local:2', out=out)
+    refused('cgls needs the whole volume: leave out slab and cluster', lm.CGLS(niter=1), cluster='local:2', out=out)
     refused('write local:N', cluster='local:0', out=out)
     refused('no scheduler answers', cluster='tcp://127.0.0.1:1', out=out)
     refused('there is no such file of a scheduler', cluster=str(tmp_path / 'none.json'), out=out)
     refused('cluster must be an address', cluster=3, out=out)
+
+
+@pytest.mark.parametrize('words, message', [
+    ('sart --start fit --cluster local:2', 'a volume in slabs starts empty: leave out --start, or --cluster'),
+    ('cgls --cluster local:2', '--algorithm cgls needs the whole volume: leave out --cluster, or'),
+    ('cgls --slab 64 --cluster local:2', 'leave out --slab and --cluster, or'), ('fdk --slab 0', 'from 1 on, not 0'),
+])  # fmt: skip
+def test_options_that_were_given(words, message):
+    args = reconstruct.parser().parse_args(['walnut', '--out', 'a.ome.zarr', '--algorithm', *words.split()])
+    with pytest.raises(InputError, match=message):
+        reconstruct.check_arguments(args)
