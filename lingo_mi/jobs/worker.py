@@ -114,6 +114,10 @@ def prepare(worker: Any, folder: str | None, threads: int, variant: str | None) 
         If it cannot do the jobs. The line names the worker.
     """
     require_fit(describe_worker(folder, worker), folder, variant)
+    # Dask's profiler may be the last to hold a task's frame, and free its arrays in the worker's main thread. That waits for
+    # Dr.Jit's lock while it holds Python's, and the task's thread may wait for Python's while it holds Dr.Jit's.
+    if profile := worker.periodic_callbacks.get('profile'):
+        worker.loop.add_callback(profile.stop)
     try:
         _prepare(threads, variant)
     except InputError as error:

@@ -106,6 +106,16 @@ def test_a_worker_that_lacks_the_package(client, monkeypatch):
         Cluster(client, None, 0, None)
 
 
+def profiled(dask_worker):
+    return dask_worker.periodic_callbacks['profile'].is_running()
+
+
+def test_frames_are_not_profiled(client):
+    """The profiler would free a task's arrays in another thread, which can wait for ever."""
+    Cluster(client, None, 0, mi.variant(), bar=False).run([Job(str(i), 1, waits) for i in range(4)], lambda _: None)
+    assert not any(client.run(profiled).values())
+
+
 def waits(*, report):
     time.sleep(0.5)
 
