@@ -148,7 +148,7 @@ class Projector(LinearMap):
             Rays to use instead of `A.geometry.rays().vectors`, [view, 4, 3], mm, of the volume's library: for each view the
             source (in a parallel beam its direction), the corner of the panel, and the steps u and v from pixel to pixel. Rays of
             float64 are used in float64. The volume then has no batch axes, and both arrays are differentiable once, in reverse
-            mode (in PyTorch also by `torch.func.grad`, but not under `vmap`), and with Dr.Jit also in forward mode.
+            mode, and with Dr.Jit also in forward mode.
 
         Returns
         -------

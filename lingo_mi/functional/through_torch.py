@@ -30,78 +30,37 @@ def call_torch(function: Callable[..., Any], arguments: Sequence[Argument], name
         a.array.as_subclass(torch.Tensor).to(torch.float64 if a.double else torch.float32).contiguous()
         for a in arguments
     ]
-    wanted = [torch.is_grad_enabled() and a.requires_grad for a in plain]
-    return _OfDrJit.apply(_Recording(function, wanted, name), *plain)
+    return _OfDrJit.apply(function, *plain)
 
 
-class _Recording:
-    """Dr.Jit's graph of one call, from PyTorch's forward pass to its backward passes."""
-
-    def __init__(self, function: Callable[..., Any], wanted: Sequence[bool], name: str):
-        self.function, self.wanted, self.name = function, wanted, name
-
-    def values(self, arrays: Sequence[torch.Tensor]) -> torch.Tensor:
-        self.tensors: Any = [_tensor(a.detach()) for a in arrays]
-        for tensor, is_wanted in zip(self.tensors, self.wanted):
-            if is_wanted:
-                dr.enable_grad(tensor)
-        self.result = self.function(*self.tensors)
-        return dr.detach(self.result).torch().clone()
-
-    def gradients(self, upstream: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """The gradients by the arrays that are wanted."""
-        with drjit_lock():
-            dr.clear_grad(self.tensors)
-            dr.set_grad(self.result, _tensor(upstream.detach().contiguous()))
-            dr.enqueue(dr.ADMode.Backward, self.result)
-            dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearInterior)
-            return tuple(dr.grad(t).torch().clone() for t, is_wanted in zip(self.tensors, self.wanted) if is_wanted)
-
-
-class _Function(torch.autograd.Function):
-    """A function of a `_Recording` and of tensors, with derivatives in reverse mode only."""
-
-    @staticmethod
-    def jvp(ctx: Any, *_: Any) -> None:
-        raise InputError(f'{ctx.recording.name} has no forward mode in PyTorch: take torch.func.grad or torch.func.vjp')
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple, recording: _Recording, *_: Any) -> None:
-        raise InputError(f'{recording.name} has no torch.func.vmap: call it once for each item of the batch')
-
-
-class _OfDrJit(_Function):
+class _OfDrJit(torch.autograd.Function):
     """`drjit.wrap` would give the first derivatives again if PyTorch goes back through one graph twice."""
 
     @staticmethod
-    def forward(recording: _Recording, *arrays: torch.Tensor) -> torch.Tensor:
-        return recording.values(arrays)
+    def forward(ctx: Any, function: Callable[..., Any], *arrays: torch.Tensor) -> torch.Tensor:
+        tensors: Any = [_tensor(a.detach()) for a in arrays]
+        wanted = ctx.needs_input_grad[1:]
+        for tensor, is_wanted in zip(tensors, wanted):
+            if is_wanted:
+                dr.enable_grad(tensor)
+        result = function(*tensors)
+        if any(wanted):
+            ctx.graph = tensors, result
+            ctx.save_for_backward(*arrays)  # it raises if PyTorch has freed the graph
+        return dr.detach(result).torch().clone()
 
     @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: torch.Tensor) -> None:
-        ctx.recording, *arrays = inputs
-        ctx.save_for_backward(*arrays)  # it raises if PyTorch has freed the graph
-
-    @staticmethod
+    @torch.autograd.function.once_differentiable
     def backward(ctx: Any, upstream: torch.Tensor) -> tuple:
-        gradients = iter(_Gradients.apply(ctx.recording, upstream, *ctx.saved_tensors))
-        return None, *(next(gradients) if is_wanted else None for is_wanted in ctx.recording.wanted)
-
-
-class _Gradients(_Function):
-    """The gradients, as a function of the arrays: PyTorch would otherwise leave out second derivatives without an error."""
-
-    @staticmethod
-    def forward(recording: _Recording, upstream: torch.Tensor, *_: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        return recording.gradients(upstream)
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple, output: tuple[torch.Tensor, ...]) -> None:
-        ctx.recording = inputs[0]
-
-    @staticmethod
-    def backward(ctx: Any, *_: torch.Tensor) -> None:
-        raise InputError(f'{ctx.recording.name} has first derivatives only, and this is the derivative of one')
+        tensors, result = ctx.graph
+        assert ctx.saved_tensors
+        with drjit_lock():
+            dr.clear_grad(tensors)
+            dr.set_grad(result, _tensor(upstream.contiguous()))
+            dr.enqueue(dr.ADMode.Backward, result)
+            dr.traverse(dr.ADMode.Backward, flags=dr.ADFlag.ClearInterior)
+            wanted = zip(tensors, ctx.needs_input_grad[1:])
+            return None, *(dr.grad(tensor).torch().clone() if is_wanted else None for tensor, is_wanted in wanted)
 
 
 def _tensor(array: Any) -> mi.TensorXf:

@@ -62,10 +62,10 @@ def require_close(actual, wanted):
     """Compare fits by Adam's first moments, which are sums of the steps' gradients.
 
     Adam divides by the root of a mean square. A gradient of rounding alone, such as by the rotation of a sphere, therefore
-    causes a whole step.
+    causes a whole step. Sums of float32 differ in the sixth digit of the largest value, because they are added in any order.
     """
     for name, values in wanted.state.first.items():
-        np.testing.assert_allclose(actual.state.first[name], values, atol=1e-5 * np.abs(values).max(), err_msg=name)
+        np.testing.assert_allclose(actual.state.first[name], values, atol=3e-5 * np.abs(values).max(), err_msg=name)
     for name in 'gradient', 'visits':
         np.testing.assert_allclose(getattr(actual.state, name), getattr(wanted.state, name), rtol=1e-4, atol=1e-7)
     np.testing.assert_allclose(actual.history[-1]['loss'], wanted.history[-1]['loss'], rtol=1e-5)

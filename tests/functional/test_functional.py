@@ -482,33 +482,6 @@ def test_twice_through_one_graph_of_torch():
         torch.autograd.grad(images.mean(), arrays[3])
 
 
-@pytest.mark.parametrize('function', [project, voxelize])
-def test_second_derivatives_in_torch(function):
-    """They are an error, not zero."""
-    torch = framework('torch')
-    arrays = arrays_of('torch', columns(gaussians()))
-    arrays[0].requires_grad_()
-    loss = function(*arrays, scan()).square().sum()
-    (gradient,) = torch.autograd.grad(loss, arrays[0], create_graph=True)
-    with pytest.raises(InputError, match=f'{function.__name__} has first derivatives only'):
-        torch.autograd.grad(gradient.sum() + arrays[0].sum(), arrays[0])
-
-
-@pytest.mark.parametrize('function', [project, voxelize])
-def test_gradients_by_torch_func(function):
-    torch = framework('torch')
-    arrays = arrays_of('torch', columns(gaussians()))
-
-    def loss(*arrays):
-        return function(*arrays, scan()).square().sum()
-
-    actual = torch.func.grad(loss, argnums=(0, 3))(*arrays)
-    for x in arrays:
-        x.requires_grad_()
-    for a, b in zip(actual, torch.autograd.grad(loss(*arrays), (arrays[0], arrays[3]))):
-        assert_same(host(a), host(b))
-
-
 def test_back_through_graphs_in_another_thread():
     """PyTorch does so on a GPU, in one thread for all graphs."""
     framework('torch')

@@ -272,40 +272,6 @@ def test_frameworks(kind, of):
         np.testing.assert_allclose(gradient, expected, **close)
 
 
-def test_functions_of_torch():
-    """torch.func.grad gives what `backward` does. There is no vectorisation, forward mode or second derivative."""
-    torch = pytest.importorskip('torch', reason='torch is not installed')
-    A, x = Projector(SCANS['cone']), torch.tensor(volume())
-    rays = torch.tensor(SCANS['cone'].rays().vectors, requires_grad=True)
-
-    def loss(x, rays):
-        return A(x, rays=rays).square().sum()
-
-    by_volume, by_rays = torch.func.grad(loss, argnums=(0, 1))(x, rays.detach())
-    assert by_volume.shape == x.shape and torch.equal(torch.autograd.grad(loss(x, rays), rays)[0], by_rays)
-    refused = {
-        'has no torch.func.vmap': lambda: torch.func.vmap(lambda rays: A(x, rays=rays))(torch.stack([rays, rays])),
-        'has no forward mode': lambda: torch.func.jvp(lambda rays: A(x, rays=rays), (rays,), (rays,)),
-        'has first derivatives only': lambda: torch.func.grad(
-            lambda rays: torch.func.grad(loss, argnums=1)(x, rays).sum()
-        )(rays),
-    }
-    for message, function in refused.items():
-        with pytest.raises(InputError, match=message):
-            function()
-
-
-@pytest.mark.parametrize('power', [1, 2])
-def test_second_derivatives_in_torch(power):
-    """They are an error, not zero."""
-    torch = pytest.importorskip('torch', reason='torch is not installed')
-    A, rays = Projector(SCANS['cone']), torch.tensor(SCANS['cone'].rays().vectors, requires_grad=True)
-    loss = (A(torch.tensor(volume()), rays=rays) ** power).sum()
-    (gradient,) = torch.autograd.grad(loss, rays, create_graph=True)
-    with pytest.raises(InputError, match='has first derivatives only'):
-        torch.autograd.grad(gradient.sum() + rays.sum(), rays)
-
-
 def _without(value, at=(1, 0, 2)):
     out = SCANS['cone'].rays().vectors
     out[at] = value
