@@ -51,8 +51,8 @@ def simulate(
         [x, y, z] of densities per mm (NumPy, or anything with `__array__` or `__dlpack__`).
     geometry : Geometry or None
         The scanner of a phantom or a volume. A volume must have `geometry.grid.shape` voxels. Without a geometry, a phantom is
-        scanned as in X3D: a cone beam, `views` views over half a turn (default: 50), and as many random ones held out. If
-        the grid of the geometry is not the phantom's, its voxels are scanned instead of its formula.
+        scanned as in X3D: a cone beam, `views` views over half a turn (default: 50), and as many random ones held out. If the
+        geometry has another grid, the phantom's voxels are scanned instead of its formula.
     views : int or None
         How many of the views to fit, evenly spaced (default: all). The rest are held out, unless the scene or `held_out`
         provides held-out views. For a phantom without a geometry: how many views to scan.

@@ -106,9 +106,9 @@ def reconstruct(
         to `out`, so the volume need not fit into memory. While they work, iterative algorithms store the volume in a folder
         beside `out`, whose name ends in .slabs. If they are stopped, the same call continues.
     cluster : str or Client, optional
-        A Dask cluster whose workers make the slabs (default: of 64 slices) and write them to `out`, an .ome.zarr: the scheduler's
-        address or file, 'local:N' for N processes of this machine, or a client of `distributed`. Workers must see the folder of
-        `out`. The volume is the same as on one process. If a worker dies, another makes its slab.
+        A Dask cluster whose workers make the slabs (default: of 64 slices) and write them to `out`, an .ome.zarr. The cluster
+        is the scheduler's address or file, 'local:N' for N processes of this machine, or a client of `distributed`. Workers must
+        see the folder of `out`. The volume is the same as on one process. If a worker dies, another makes its slab.
     force : bool
         Replace an earlier file.
     progress : bool

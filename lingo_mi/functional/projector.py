@@ -46,8 +46,8 @@ class Projector(LinearMap):
         The scanner and the grid of the volume.
     model : {'joseph', 'exact'}
         'joseph' samples each ray once a slice of voxels, and interpolates there (error about 0.5 % of the line integrals).
-        'exact' integrates the trilinear interpolant exactly, and takes 2 to 8 times as long. If the source is beside or inside
-        the volume, the model is always 'exact'.
+        'exact' integrates the trilinear interpolant exactly, and takes 2 to 8 times as long. Unless the whole
+        volume lies in front of the source, the model is always 'exact'.
     views : slice or sequence of int, optional
         Views of the geometry (default: all).
     valid : array of bool, optional

@@ -137,7 +137,7 @@ class Geometry(ABC):
         nDetector, dDetector
             Pixels and pixel size in mm, (v, u).
         angles : [n]
-            Radians, n >= 1. Whole numbers over more than four turns cause a warning, because they look like degrees.
+            Radians, n >= 1. Whole numbers that span more than four turns cause a warning, because they look like degrees.
         **placement
             The voxels: either `grid`, or TIGRE's numbers (x, y, z): nVoxel, dVoxel in mm, and offOrigin, the centre, in mm. The
             other numbers are 0 by default, and `trajectories.Motion` defines them: offDetector, (v, u) mm, shifts the panel, a
@@ -147,7 +147,7 @@ class Geometry(ABC):
         Returns
         -------
         Geometry
-            A `CircularGeometry` without rotDetector, COR, tilt and height.
+            A `CircularGeometry` if rotDetector, COR, tilt and height are 0, otherwise a scan with poses.
 
         Raises
         ------
@@ -185,7 +185,7 @@ class Geometry(ABC):
         Returns
         -------
         Geometry
-            A `CircularGeometry` without rotDetector, COR, tilt and height.
+            A `CircularGeometry` if rotDetector, COR, tilt and height are 0, otherwise a scan with poses.
 
         Raises
         ------

@@ -141,7 +141,7 @@ class Best(Algorithm):
     4. `ASDPOCS` and `SART` get all their passes, unless a refinement is already far ahead of `ASDPOCS`.
     5. The setting that predicts the held-out views best, with its number of passes, is applied to all views.
 
-    Smaller voxels suit objects finer than the voxels, because the scan's voxels turn such detail into streaks. Streaks lie along
+    Smaller voxels suit objects with detail finer than the scan's voxels, which turn it into streaks. Streaks lie along
     the views of the reconstruction, and held-out views hardly show them. The scan's own voxels must therefore be 2 % better.
     `SART` and `ASDPOCS`, which leave more streaks and noise than a refinement, must be 1.5 % better, unless `voxels` is 'values',
     whose purpose is to predict views.
@@ -153,7 +153,7 @@ class Best(Algorithm):
     finer : int
         Parts along each side of a smaller voxel, at least 1. 1 tries only the scan's voxels. Memory grows with the cube.
     held_out : int
-        One view in `held_out` is held out, at least 2.
+        One view in every `held_out` is held out. It is at least 2.
     cloud : bool
         Whether to try the volume of a fitted cloud as a start, which takes two fits.
     seed : int

@@ -23,7 +23,7 @@ class Fast(DensityMethod):
 
     - Within the masks, Gaussians start on the edges of a quick reconstruction, and their densities are the densities of its
       voxels.
-    - Beside L1, the loss has the gradient of the difference, which restores fine detail sooner, and more weight on SSIM.
+    - Besides L1, the loss has the gradient of the difference, which restores fine detail sooner, and more weight on SSIM.
     - Rates are 3 to 40 times those of `LINGO`, and fall over the run. Adam's second moment has a shorter memory, its first one is
       Nesterov's, and the result is the mean of the last steps.
     - Successive views lie well apart.
